@@ -1,1 +1,1 @@
-"""Long-run studies and timings: `python -m benchmarks.closures` and its siblings."""
+"""Long-run studies and timings: run one as `python -m benchmarks.closures`."""

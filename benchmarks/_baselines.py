@@ -1,11 +1,13 @@
-"""Methods of others for nonholonomic systems, to compare with; no part of the library.
+"""Published methods for nonholonomic systems, for comparisons with nhjax.
 
-All are for one constraint linear in the velocities and a Lagrangian of unit mass,
+All these methods are written for one constraint that is linear in the velocities, and a
+Lagrangian with unit masses,
 
     L = ½ |v|² - V(q),   Φ = b(q)·v,   f = -∇V,
 
-which is what the paper's experiments on vector spaces have. A step maps (q, v) to
-(q, v) with b(q)·v = 0 at both ends. The equations are derived from the definitions.
+as in the paper's experiments on vector spaces. A step maps (q, v) at the start of the
+step to (q, v) at its end; both satisfy b(q)·v = 0. The equations of each method are
+derived from its definition.
 """
 
 from collections.abc import Callable
@@ -21,7 +23,8 @@ import nhjax
 
 Step = Callable[[Array, Array, Array], tuple[Array, Array]]
 
-# A sweep on the multipliers gains a factor O(h²): at h = 0.3 these are some twenty.
+# Each sweep on the multipliers reduces the error by a factor O(h²): at h = 0.3, about
+# twenty sweeps reach round-off.
 MOST_SWEEPS = 60
 
 
@@ -33,7 +36,7 @@ class Natural(NamedTuple):
 
 
 def natural(system: nhjax.LagrangianSystem) -> Natural:
-    """Read f and b off a system of unit mass with one constraint linear in v."""
+    """Derive f and b from a system with unit masses and one constraint linear in v."""
 
     def force(q: Array) -> Array:
         return jax.grad(system.lagrangian, argnums=1)(0.0, q, jnp.zeros_like(q), None)
@@ -48,13 +51,13 @@ def natural(system: nhjax.LagrangianSystem) -> Natural:
 
 
 def projected(nat: Natural, q: Array, v: Array) -> Array:
-    """Project v onto b(q)·v = 0."""
+    """Project v onto the velocities with b(q)·v = 0."""
     b = nat.direction(q)
     return v - b * (b @ v) / (b @ b)
 
 
 def solved(residual: Callable[[Array], tuple[Array, Any]], start: Array) -> Any:
-    """Sweep x -= r(x) until r is round-off, and return what comes with r."""
+    """Repeat x -= r(x) until r is round-off; return the second result of `residual`."""
     eps = float(jnp.finfo(start.dtype).eps)
 
     def body(carry):
@@ -64,7 +67,8 @@ def solved(residual: Callable[[Array], tuple[Array, Any]], start: Array) -> Any:
 
     def goes_on(carry):
         x, size, before, k = carry
-        # Far from round-off a sweep may be larger than that before it.
+        # The iteration stops if a change is not smaller than the change before it, but
+        # only near round-off: far from round-off, changes may grow for some sweeps.
         near = size <= 1e3 * eps * (1.0 + jnp.max(jnp.abs(x)))
         return (size > 0) & ~(near & (size >= before)) & (k < MOST_SWEEPS)
 
@@ -74,18 +78,20 @@ def solved(residual: Callable[[Array], tuple[Array, Any]], start: Array) -> Any:
 
 
 def discrete_lagrange_dalembert(nat: Natural) -> Step:
-    """Make the step of the discrete Lagrange-d'Alembert method, as a leapfrog.
+    """Create the step of the discrete Lagrange-d'Alembert method, as a leapfrog.
 
     Cortés and Martínez (2001): with a discrete Lagrangian L_d(q_k, q_{k+1}) and a
     discrete constraint ω_d(q_k, q_{k+1}) = 0,
 
         D₁L_d(q_k, q_{k+1}) + D₂L_d(q_{k-1}, q_k) + λ_k b(q_k) = 0.
 
-    Here L_d = h (½ |Δq/h|² - ½ V(q_k) - ½ V(q_{k+1})), ω_d = b((q_k + q_{k+1})/2)·Δq,
-    which McLachlan and Perlmutter (2006) write as a leapfrog: half a kick by f + λ b
-    at q_k such that the drift to q_{k+1} satisfies ω_d = 0, the drift, and half a kick
-    by f. The velocity at a node is then projected on the constraint there; that moves
-    it along b(q_k), which the next λ_k makes up for: positions do not depend on it.
+    Here Δq = q_{k+1} - q_k, L_d = h (½ |Δq/h|² - ½ V(q_k) - ½ V(q_{k+1})), and
+    ω_d = b((q_k + q_{k+1})/2)·Δq. McLachlan and Perlmutter (2006) write this method as
+    a leapfrog with three parts: half a kick by f + λ b at q_k, a drift to q_{k+1}, and
+    half a kick by f. The multiplier λ is such that the drift satisfies ω_d = 0. The
+    velocity at q_{k+1} is then projected onto the constraint. The projection changes
+    the velocity by a multiple of b(q_{k+1}), and the next multiplier compensates this
+    change, so that positions do not depend on the projection.
     """
 
     def step(q: Array, v: Array, h: Array) -> tuple[Array, Array]:
@@ -105,11 +111,11 @@ def discrete_lagrange_dalembert(nat: Natural) -> Step:
 
 
 def leapfrog_at_nodes(nat: Natural) -> Step:
-    """Make the step of the leapfrog that takes the constraint at the nodes.
+    """Create the step of the leapfrog that evaluates the constraint at the nodes.
 
     Ferraro, Iglesias and Martín de Diego (2008): b(q_k)·(v_{k-1/2} + v_{k+1/2}) = 0,
-    v_{k+1/2} - v_{k-1/2} = h (f + λ b)(q_k). The second argument and result of the step
-    are v_{k-1/2} and v_{k+1/2}: it maps (q_k, v_{k-1/2}) to (q_{k+1}, v_{k+1/2}).
+    v_{k+1/2} - v_{k-1/2} = h (f + λ b)(q_k). The step uses velocities in the middle
+    between nodes: it maps (q_k, v_{k-1/2}) to (q_{k+1}, v_{k+1/2}).
     """
 
     def step(q: Array, v: Array, h: Array) -> tuple[Array, Array]:
@@ -121,19 +127,19 @@ def leapfrog_at_nodes(nat: Natural) -> Step:
 
 
 def spark(nat: Natural, stages: int) -> Step:
-    """Make the step of the Lobatto IIIA-B SPARK method with s stages.
+    """Create the step of the Lobatto IIIA-B SPARK method with s stages.
 
-    Reconstructed from the definition of Jay's methods for DAEs of index 2, without his
-    report of 2009, which was not at hand: the stages
+    The method is reconstructed from the definition of Jay's methods for DAEs of index
+    2, because his report of 2009 was not available. The stages are
 
         Q_i = q_0 + h Σ_j a_ij V_j,  V_i = v_0 + h Σ_j â_ij (f + Λ_j b)(Q_j)
 
-    with s multipliers of their own in each step, and the constraint at the end of the
-    step and in s - 1 means over its stages,
+    with s multipliers Λ_j. The s equations for them are the constraint at the end of
+    the step, and s - 1 weighted means of the constraint over the stages,
 
         Σ_j b_j c_j^l b(Q_j)·V_j = 0,  l = 0..s-2,    b(q_1)·v_1 = 0.
 
-    No multiplier is carried from one step to the next.
+    A step does not use multipliers of the previous step.
     """
     method = nhjax.LobattoIIIAB(stages)
     powers = np.vander(method.c, stages - 1, increasing=True).T
@@ -171,9 +177,10 @@ def spark(nat: Natural, stages: int) -> Step:
 
 
 def projected_rk4(nat: Natural) -> Step:
-    """Make the step of the classical Runge-Kutta method, projected on the constraint.
+    """Create the step of the classical Runge-Kutta method, with a projection.
 
-    It integrates q̈ = f + λ b, λ = -(b·f + v·b'(q)v)/(b·b), and projects v at the end.
+    The step integrates q̈ = f + λ b with λ = -(b·f + v·b'(q)v)/(b·b), and projects v
+    onto the constraint at the end.
     """
 
     def field(q: Array, v: Array) -> tuple[Array, Array]:
@@ -205,7 +212,7 @@ def run(
     every: int = 1,
     observe: Callable[[Array, Array], Any] = lambda q, v: (q, v),
 ) -> Any:
-    """Run a method and save what `observe` makes of every so many steps."""
+    """Run a method, and save `observe(q, v)` after each `every` steps."""
     h = jnp.asarray(h, q.dtype)
 
     def block(state, _):

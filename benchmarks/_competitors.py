@@ -1,9 +1,9 @@
-"""What one would use instead of nhjax: the equations by hand, and solvers for them.
+"""Alternatives to nhjax: equations of motion by hand, and solvers of other libraries.
 
-The multiplier is eliminated in closed form: where M is a multiple of the identity on
-the constrained coordinates, as in all four systems, a = f + Bᵀλ with B a = γ gives
-λ = (γ - B f)/(B Bᵀ), and no linear algebra is left. The equations are written on
-scalars, so that the same lines serve JAX, plain Python and long double NumPy.
+In all four systems, M is the identity on the constrained coordinates. The accelerations
+a = f + Bᵀλ with B a = γ then give the multiplier λ = (γ - B f)/(B Bᵀ) in closed form,
+without linear algebra. The equations are written in scalars, so that the same functions
+work for JAX, plain Python and NumPy's long double.
 """
 
 import math
@@ -24,7 +24,7 @@ from sksundae.ida import IDA
 from nhjax import systems
 
 
-# f, the nonzero entries of the one row of B, and γ.
+# The force f, the nonzero entries of the only row of B by index, and γ.
 Forces = tuple[list, dict[int, Any], Any]
 
 
@@ -36,7 +36,8 @@ def _particle(lib: Any, q: Sequence, v: Sequence) -> Forces:
 def _cvt(lib: Any, q: Sequence, v: Sequence) -> Forces:
     x, y, z = q
     sin = lib.sin(y)
-    # The default ε = ½; cos 2y = 1 - 2 sin² y spares a cosine.
+    # The parameter ε has its default ½. The identity cos 2y = 1 - 2 sin² y saves the
+    # evaluation of a cosine.
     f = [-x, -sin - 0.5 * (1 - 2 * sin * sin), -z]
     return f, {0: sin, 2: 1.0}, -lib.cos(y) * v[1] * v[0]
 
@@ -64,7 +65,10 @@ def _unicycle(lib: Any, q: Sequence, v: Sequence) -> Forces:
 
 
 def _reduced_unicycle(lib: Any, y: Sequence) -> list:
-    """(x, y, θ, u, ω) with the sideways velocity left out altogether."""
+    """Compute the rate of (x, y, θ, u, ω), without a variable for the zero side slip.
+
+    The speed u is along the heading θ, and ω = dθ/dt.
+    """
     x1, x2, heading, u, omega = y
     cos, sin = lib.cos(heading), lib.sin(heading)
     return [u * cos, u * sin, omega, -(x1 * cos + x2 * sin), 0.0 * omega]
@@ -79,23 +83,27 @@ def _eliminated(forces: Callable[..., Forces], lib: Any, y: Sequence) -> list:
         defect = defect - b * f[i]
         size = size + b * b
     multiplier = defect / size
-    # Not `f + 0 λ`: it would cost the plain Python form.
+    # The terms `0 λ` are omitted, because plain Python would compute them.
     return [*v, *(x + row[i] * multiplier if i in row else x for i, x in enumerate(f))]
 
 
 class Problem(NamedTuple):
-    """One system: nhjax's form of it, and the equations by hand."""
+    """One system: its example in nhjax, and its equations by hand."""
 
     example: Any
     forces: Callable[..., Forces]
     field: Callable[[Any, Sequence], list]
     to_state: Callable[[Any, Any], Any]  # (q, v) to the state of `field`
     from_state: Callable[[Any], tuple[Any, Any]]
-    # By how much q turns the velocity of `forces` against that of nhjax.
+    # The angle by which the velocity in nhjax is rotated to get the velocity that
+    # `forces` takes, as a function of q.
     turn: Callable[[np.ndarray], float]
 
     def members(self, number: int) -> tuple[Array, Array]:
-        """Initial (q, v) of so many members; the example's own if it is one."""
+        """Return the initial (q, v) of `number` members.
+
+        A single member starts from the state of the example.
+        """
         q0, v0 = self.example.q0, self.example.v0
         if number == 1:
             return q0[None], v0[None]
@@ -108,7 +116,7 @@ class Problem(NamedTuple):
         return q, v
 
     def exact(self, q: np.ndarray, v: np.ndarray, t: float) -> np.ndarray | None:
-        """(q, v) at `t` of each member, where a closed form is known."""
+        """Return (q, v) of each member at the time `t`, or None without closed form."""
         kind = type(self.example)
         if not hasattr(kind, "exact"):
             return None
@@ -138,7 +146,7 @@ def _on_vector_space(example: Any, forces: Callable[..., Forces]) -> Problem:
 
 
 def problems() -> dict[str, Problem]:
-    """The systems by name, with default parameters."""
+    """Return the systems by name, with default parameters."""
     return {
         "chaotic": _on_vector_space(systems.ChaoticSystem(), _chaotic),
         "particle": _on_vector_space(systems.NonholonomicParticle(), _particle),
@@ -155,10 +163,11 @@ def problems() -> dict[str, Problem]:
 
 
 def extrapolated(problem: Problem, y0: np.ndarray, t: float, step: float) -> np.ndarray:
-    """The state of `field` at `t` by Gragg's extrapolation, order 20, in long double.
+    """Compute a reference at `t` by Gragg's extrapolation of order 20, in long double.
 
-    It shares neither coefficients nor, where long double is wider, round-off with what
-    it is a reference for.
+    The result is the state of `field`. The reference has no coefficients in common with
+    the methods that it judges. Its round-off is smaller too, on machines where long
+    double has more digits than float64.
     """
     lib, half = np, np.longdouble(0.5)
     y = np.asarray(y0, np.longdouble).T
@@ -174,7 +183,7 @@ def extrapolated(problem: Problem, y0: np.ndarray, t: float, step: float) -> np.
         table: list[np.ndarray] = []
         for k, division in enumerate(divisions):
             part = h / division
-            # In increments from y, which keeps round-off far below y's.
+            # Sums are increments of y, whose round-off is far below the round-off of y.
             before, now = np.zeros_like(y), part * start
             for _ in range(division - 1):
                 before, now = now, before + 2 * part * field(y + now)
@@ -197,11 +206,12 @@ SOLVERS = {
 def diffrax_run(
     problem: Problem, solver: str, layout: str, fixed: bool, t: float
 ) -> Callable[[Any, Array], Any]:
-    """The end state from the initial state and a tolerance, or a step if `fixed`.
+    """Create a function that integrates by diffrax, and returns the state at the end.
 
-    `layout` is "array" for one trajectory; for many "vmap", with a tuple of scalars as
-    each member's state, or "stacked": one equation for all, shape (n, members), whose
-    members share their steps.
+    Its arguments are the initial state and the tolerance, or the step size if `fixed`.
+    `layout` is "array" for one trajectory. For an ensemble it is "vmap", where the
+    state of a member is a tuple of scalars, or "stacked", where all members form one
+    equation of shape (n, members) and share their steps.
     """
 
     def field(t, y, args):
@@ -221,7 +231,7 @@ def diffrax_run(
             y,
             saveat=diffrax.SaveAt(t1=True),
             stepsize_controller=controller,
-            # The fastest of the adjoints in a run without derivatives.
+            # Without derivatives, runs with this adjoint are the fastest.
             adjoint=diffrax.ForwardMode(),
             max_steps=None,
             throw=False,
@@ -232,7 +242,7 @@ def diffrax_run(
 
 
 def diffrax_state(layout: str, y0: np.ndarray) -> Any:
-    """`y0`, of shape (members, n), as the state for `layout`."""
+    """Convert `y0`, of shape (members, n), to the state for `layout`."""
     if layout == "array":
         return jnp.asarray(y0[0])
     if layout == "stacked":
@@ -241,21 +251,21 @@ def diffrax_state(layout: str, y0: np.ndarray) -> Any:
 
 
 def from_diffrax(layout: str, y: Any) -> np.ndarray:
-    """Undo `diffrax_state`."""
+    """Convert a state of `layout` back to an array of shape (members, n)."""
     if layout == "array":
         return np.asarray(y)[None]
     return np.stack([np.asarray(column) for column in y], -1)
 
 
 class HostField(NamedTuple):
-    """The right-hand side for SciPy, in its two forms."""
+    """The right-hand side for SciPy, in plain Python and as a compiled JAX function."""
 
     plain: Callable[[float, np.ndarray], np.ndarray]
     jitted: Callable[[float, np.ndarray], np.ndarray]
     jacobian: Callable[[float, np.ndarray], np.ndarray]
 
     def microseconds(self, y: np.ndarray) -> dict[str, float]:
-        """Of one evaluation, each form."""
+        """Measure the microseconds of one evaluation of each form."""
         times = {}
         for name in ("plain", "jitted"):
             field, samples = getattr(self, name), []
@@ -269,7 +279,7 @@ class HostField(NamedTuple):
 
 
 def host_field(problem: Problem) -> HostField:
-    """The right-hand side of the problem for SciPy."""
+    """Create the right-hand side of a problem for SciPy."""
 
     def plain(t: float, y: np.ndarray) -> np.ndarray:
         # Python's floats are several times faster than NumPy's scalars.
@@ -289,7 +299,10 @@ def host_field(problem: Problem) -> HostField:
 def scipy_run(
     field: HostField, form: str, method: str, y0: np.ndarray, t: float
 ) -> Callable[[float], np.ndarray | None]:
-    """The end state for a tolerance, or None where the solver gives up."""
+    """Create a function from a tolerance to the state at the end.
+
+    The function returns None if the solver fails.
+    """
     options: dict[str, Any] = {"jac": field.jacobian} if method == "Radau" else {}
 
     def run(tolerance: float) -> np.ndarray | None:
@@ -298,7 +311,7 @@ def scipy_run(
             (0.0, t),
             y0,
             method=method,
-            # SciPy takes no smaller relative tolerance.
+            # SciPy does not accept a smaller relative tolerance.
             rtol=max(tolerance, 3e-14),
             atol=tolerance,
             t_eval=(t,),
@@ -319,10 +332,11 @@ def _turned(v: np.ndarray, angle: float) -> np.ndarray:
 def ida_run(
     problem: Problem, q0: np.ndarray, v0: np.ndarray, t: float, index: int
 ) -> Callable[[float], tuple[np.ndarray, np.ndarray] | None]:
-    """(q, v) at `t` from IDA for a tolerance, or None where it gives up.
+    """Create a function from a tolerance to (q, v) at `t`, computed by IDA.
 
-    The unknowns are (q, v, λ), the equations q̇ = v, v̇ = f + Bᵀλ, and Φ = B v = 0 for
-    index 2 or its derivative B v̇ = γ for index 1.
+    The function returns None if IDA fails. The unknowns are (q, v, λ). The equations
+    are q̇ = v, v̇ = f + Bᵀλ and the constraint: Φ = B v = 0 for index 2, or its
+    derivative B v̇ = γ for index 1.
     """
     n, v0 = len(q0), _turned(v0, problem.turn(q0))
 
@@ -333,7 +347,8 @@ def ida_run(
         multiplier = state[-1]
         out = [a - b for a, b in zip(rate[:n], v, strict=True)]
         out += [a - b for a, b in zip(rate[n : 2 * n], f, strict=True)]
-        # The constraint is eliminated with v̇ = f + Bᵀλ, algebraic in λ.
+        # For index 1, v̇ = f + Bᵀλ is inserted into B v̇ = γ, which is an algebraic
+        # equation for λ.
         defect = 0.0 if index == 2 else -gamma
         for i, b in row.items():
             out[n + i] -= b * multiplier
@@ -348,7 +363,8 @@ def ida_run(
     yp0 = np.array([*start, 0.0])
 
     def run(tolerance: float) -> tuple[np.ndarray, np.ndarray] | None:
-        # BDF controls λ of an index-2 system poorly: it must not set the steps.
+        # The error estimates of BDF are poor for λ in a system of index 2. The large
+        # tolerance for λ removes its influence on the step sizes.
         atol = np.full(2 * n + 1, tolerance)
         atol[-1] = 1e3 if index == 2 else tolerance
         solver = IDA(

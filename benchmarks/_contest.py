@@ -1,4 +1,4 @@
-"""The points of work-precision diagrams, and who is first to an accuracy."""
+"""The points of work-precision diagrams, and the fastest method for each accuracy."""
 
 import json
 import math
@@ -13,13 +13,13 @@ from matplotlib.figure import Figure
 from ._report import markdown_table, number
 
 
-# The errors for which the fastest of each kind is looked for.
+# For each of these errors, the tables give the fastest method of each package.
 ACCURACIES = (1e-5, 1e-8, 1e-11)
 
 
 @dataclass
 class Run:
-    """One point of a diagram; `call` repeats it."""
+    """One point of a diagram; `call` repeats the run that it stands for."""
 
     method: str
     rung: float
@@ -34,13 +34,13 @@ class Run:
     iterations: float = math.nan  # per step of nhjax
 
     def figures(self) -> dict[str, Any]:
-        """All but the call."""
+        """Return all fields except `call`."""
         return {key: x for key, x in vars(self).items() if key != "call"}
 
 
 @dataclass
 class Measured:
-    """All runs of a system over a time, of one or many members."""
+    """All runs of one system to the time `t`, with one or many members."""
 
     name: str
     t: float
@@ -50,23 +50,27 @@ class Measured:
 
     @property
     def title(self) -> str:
-        """System, members and time in words."""
+        """Return the system, the number of members and the time in words."""
         count = "one trajectory" if self.members == 1 else f"{self.members} members"
         return f"{self.name}, {count}, t = {self.t:g}"
 
     @property
     def quality(self) -> str:
-        """What runs are judged by: the energy where no trajectory can be followed."""
+        """Return the quantity by which runs are judged.
+
+        It is the error of the state, or the energy error if there is no reference for
+        the state, because the motion is chaotic.
+        """
         known = any(math.isfinite(run.error) for run in self.runs)
         return "error" if known else "energy_error"
 
     def section(self) -> str:
-        """The tables of the report."""
+        """Return the tables of this system for the report."""
         parts = [f"## {self.title}", contest_table(self), run_table(self.runs)]
         return "\n\n".join([*parts, self.note] if self.note else parts)
 
     def data(self) -> dict[str, Any]:
-        """For the JSON file."""
+        """Return the data for the JSON file."""
         return vars(self) | {
             "runs": [run.figures() for run in self.runs],
             "contest": contests(self),
@@ -74,7 +78,7 @@ class Measured:
 
 
 def kept(path: Path) -> dict[str, Measured]:
-    """The cases in a JSON file by title, if there is one."""
+    """Read the cases of a JSON file by title; without the file there are none."""
     if not path.exists():
         return {}
     cases = {}
@@ -90,7 +94,7 @@ def kept(path: Path) -> dict[str, Measured]:
 
 
 def by_method(runs: list[Run]) -> dict[str, list[Run]]:
-    """The ladders."""
+    """Group runs by method, so that each list is a ladder."""
     ladders: dict[str, list[Run]] = {}
     for run in runs:
         ladders.setdefault(run.method, []).append(run)
@@ -100,11 +104,13 @@ def by_method(runs: list[Run]) -> dict[str, list[Run]]:
 def seconds_at(
     ladder: list[Run], accuracy: float, quality: str, of: str
 ) -> tuple[float, float]:
-    """Time of an error, between rungs by powers, and the rung next to it.
+    """Interpolate the time for an error in a ladder; return also the nearest rung.
 
-    Infinite where no rung is as accurate; a ladder that starts more accurate counts
-    with its first rung. A rung that is accurate by chance, while finer ones are not,
-    does not count: errors are the largest of the rung and of all finer ones.
+    A rung is a step size or a tolerance. Between two rungs, the time is taken as a
+    power of the error. The time is infinite if no rung is accurate enough. If the first
+    rung is more accurate already, the result is its time. The error of a rung is the
+    largest of its own error and of the errors of all finer rungs, so that a rung which
+    is accurate by chance does not count.
     """
     best = (math.inf, math.nan)
     coarser = None
@@ -122,15 +128,21 @@ def seconds_at(
 
 
 def kind(method: str) -> str:
-    """What competes as one: a package, that on several cores apart."""
+    """Return the name of the group of a method.
+
+    A group has the methods of one package. Its runs on several cores, with the word
+    "devices" or "threads" in their names, form a separate group.
+    """
     words = method.split()
     return " ".join([words[0], *(x for x in words if x in ("devices", "threads"))])
 
 
 def contests(case: Measured) -> list[dict[str, Any]]:
-    """For each accuracy the fastest of each kind, and nhjax's time over it.
+    """Find the fastest method of each group for each accuracy.
 
-    "others" is the fastest of all that is not nhjax, under the fastest of nhjax.
+    Each entry also has the ratio of nhjax's time to the time of this method. The entry
+    "others" is the fastest method of all other packages, with the ratio of nhjax's best
+    time to its time.
     """
     ladders = by_method(case.runs)
     kinds = list(dict.fromkeys(kind(method) for method in ladders))
@@ -153,7 +165,10 @@ def contests(case: Measured) -> list[dict[str, Any]]:
 
 
 def fastest_of_others(best: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """The method that is the fastest of all others, and nhjax's best time over its."""
+    """Return the fastest method of other packages, and its ratio to nhjax's best time.
+
+    The ratio is nhjax's time divided by the time of this method.
+    """
     mine = [entry for name, entry in best.items() if name.startswith("nhjax")]
     names = [name for name in best if not name.startswith("nhjax")]
     found: dict[str, Any] = {}
@@ -162,7 +177,7 @@ def fastest_of_others(best: dict[str, dict[str, Any]]) -> dict[str, Any]:
             break
         name = min(names, key=lambda name, of=of: best[name][of])
         seconds = best[name][of]
-        # The method is that of the median.
+        # The named method is the method with the smallest median time.
         found.setdefault("method", best[name]["method"])
         found[of] = seconds
         found[f"ratio_{of}"] = quotient(min(entry[of] for entry in mine), seconds)
@@ -170,7 +185,7 @@ def fastest_of_others(best: dict[str, dict[str, Any]]) -> dict[str, Any]:
 
 
 def contest_table(case: Measured) -> str:
-    """`contests`, with the ratios of the fastest times in brackets."""
+    """Format `contests` as a table, with the ratios of fastest times in brackets."""
     rows, header = [], []
     for outcome in contests(case):
         header, row = [case.quality.replace("_", " ")], [f"{outcome['accuracy']:.0e}"]
@@ -196,23 +211,26 @@ def contest_table(case: Measured) -> str:
 
 
 def ratios(entry: dict[str, Any]) -> str:
-    """The ratio of medians, and that of the fastest in brackets, or nothing."""
+    """Format the ratio of medians, and in brackets the ratio of fastest times.
+
+    The result is empty if a time is missing.
+    """
     ratio, other = entry["ratio_seconds"], entry["ratio_fastest"]
     return "" if math.isnan(ratio) else f"{ratio:.2f} ({other:.2f})"
 
 
 def quotient(a: float, b: float) -> float:
-    """a / b of times, or NaN where one was not reached."""
+    """Return the ratio of two times, or NaN if one of them is infinite."""
     return a / b if math.isfinite(a) and math.isfinite(b) else math.nan
 
 
 def ms(seconds: float) -> str:
-    """Milliseconds, or nothing."""
+    """Format a time in milliseconds; an infinite time gives an empty text."""
     return f"{1e3 * seconds:.3g}" if math.isfinite(seconds) else ""
 
 
 def run_table(runs: list[Run]) -> str:
-    """Every rung."""
+    """Return a table of all runs, one row for each rung of each ladder."""
     header = [
         "method",
         "h or tolerance",
@@ -236,7 +254,10 @@ def run_table(runs: list[Run]) -> str:
 
 
 def draw(cases: list[Measured], path: Path) -> None:
-    """Error against time, a panel for each case; energy error where there is none."""
+    """Plot error against time, with a panel for each case.
+
+    If a case has no errors of the state, its panel shows energy errors.
+    """
     columns = min(3, len(cases))
     lines = -(-len(cases) // columns)
     figure = Figure(figsize=(7.2 * columns, 4.2 * lines), layout="constrained")
@@ -252,7 +273,7 @@ def draw(cases: list[Measured], path: Path) -> None:
             x = [1e3 * run.seconds for run in ladder]
             y = [getattr(run, case.quality) for run in ladder]
             mine = method.startswith("nhjax")
-            # The darker, the higher s.
+            # Methods with more stages have darker lines.
             shade = ""
             if mine:
                 stages = int(method.split("s=")[1].split(",")[0])
@@ -263,7 +284,8 @@ def draw(cases: list[Measured], path: Path) -> None:
             style |= {"markersize": 4}
             spread = "devices" in method or "threads" in method
             style |= {"linestyle": ":" if spread else "-"}
-            # One name for all tolerances of an s, and one for all that is spread.
+            # The legend has one entry for all tolerances of a number of stages, and one
+            # entry for all runs of nhjax on several devices.
             label = kind(method) if mine and spread else method.split(",")[0]
             style |= {"label": None if label in named else label}
             named.add(label)

@@ -1,4 +1,4 @@
-"""Systems that several benchmarks run, each with a state to start from."""
+"""Systems that several benchmarks use, each with an initial state."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,7 @@ _INERTIA = ((1.0, 0.1, 0.2), (0.1, 1.4, -0.15), (0.2, -0.15, 0.8))
 
 
 def of_the_gallery(kind: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of an example's parameters that makes its system and state."""
+    """Return a function from an example's parameters to its system and state."""
 
     def build(**parameters):
         example = kind(**parameters)
@@ -26,7 +26,7 @@ def of_the_gallery(kind: Callable[..., Any]) -> Callable[..., Any]:
 def suslov_in_a_potential(
     retraction: AbstractRetraction = nhjax.Cayley(),  # noqa: B008 -- immutable
 ) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
-    """Suslov's problem with a full matrix of inertia and V = 0.3 R₃₃."""
+    """Create Suslov's problem with a full matrix of inertia, and L = T - 0.3 R₃₃."""
     inertia, manifold = jnp.asarray(_INERTIA), nhjax.SO3(retraction)
 
     def lagrangian(t, q, v, args):
@@ -40,10 +40,11 @@ def suslov_in_a_potential(
 
 
 def wheeled_inverted_pendulum() -> tuple[Any, Any, Any, Any]:
-    """A robot that balances on two wheels by feedback: six coordinates, no gallery.
+    """Create a robot that balances on two wheels by feedback.
 
-    The coordinates are x, y, the heading, the lean and the angles of the wheels.
-    Returns the system, q, v and the gains of the feedback as `args`.
+    It is not a system of the gallery. Its six coordinates are x, y, the heading, the
+    lean and the angles of the wheels. Returns the system, q, v, and the gains of the
+    feedback, which are its `args`.
     """
     body, base, radius, height, track = 6.0, 1.5, 0.1, 0.35, 0.5
     inertia = jnp.array([0.05, 0.04, 0.03])

@@ -1,16 +1,18 @@
 """heyoka as a competitor: Taylor series of high order, compiled by LLVM.
 
-The index-reduced equations are those of `_competitors`, written for Taylor series, in
-which products and quotients cost a sum over all orders and sums cost nothing: factors
-are taken out, and squares, which cost half, are powers. They run in the form that is
-the fastest for systems as small as these: with `fast_math`, up to 1.7 times as fast as
-without, and no less accurate; without `compact_mode`, which takes about twice as long.
-`force_avx512`, `slp_vectorize` and `high_accuracy` gain neither time nor accuracy.
+The index-reduced equations are the equations of `_competitors`, rewritten for Taylor
+series. There, a product or a quotient costs a sum over all orders, a square costs half
+of this, and sums are cheap. Therefore common factors are taken out, and squares are
+written as powers. The options are the fastest for such small systems: `fast_math` makes
+runs up to 1.7 times faster, and not less accurate. `compact_mode` is off, because it
+makes runs about twice as long. `force_avx512`, `slp_vectorize` and `high_accuracy`
+improve neither time nor accuracy.
 
 An ensemble runs member by member, or in batches whose members are in the lanes of a
-vector. `ensemble_propagate_until`, which heyoka has for ensembles, links a copy of the
-integrator for each of its iterations, which takes longer than these runs. So batches
-run on threads in another form too: each thread with a copy of its own, made once.
+vector. heyoka's own function for ensembles, `ensemble_propagate_until`, links a copy of
+the integrator for each member or batch, which takes longer than these runs. A second
+form with threads is therefore measured too: each thread has one copy of the integrator,
+which is created once.
 """
 
 import time
@@ -24,10 +26,12 @@ import heyoka as hy
 import numpy as np
 
 
-# It would answer with what an earlier process has compiled.
+# With the disk cache, compile times would be those of loading a program that an earlier
+# process has compiled.
 hy.llvm_state.set_diskcache_enabled(False)
 VERSION = hy.__version__
-# The order of the series follows from the tolerance: 4 at the first, 20 at the last.
+# The order of the series follows from the tolerance: it is 4 for the first tolerance,
+# and 20 for the last one.
 TOLERANCES = (*(10.0**-k for k in range(3, 16)), float(np.finfo(float).eps))
 
 
@@ -42,7 +46,8 @@ def _cvt(state: Sequence[Any]) -> list[Any]:
     sin, cos = hy.sin(y), hy.cos(y)
     square = sin**2
     multiplier = (x * sin + z - cos * (v[0] * v[1])) / (1.0 + square)
-    # The default ε = ½; cos 2y = 1 - 2 sin² y spares a cosine.
+    # The parameter ε has its default ½. The identity cos 2y = 1 - 2 sin² y saves the
+    # evaluation of a cosine.
     return [*v, sin * multiplier - x, square - sin - 0.5, multiplier - z]
 
 
@@ -73,22 +78,22 @@ FIELDS: dict[str, tuple[int, Callable[[Sequence[Any]], list[Any]]]] = {
 
 
 def equations(name: str) -> list[tuple[Any, Any]]:
-    """The pairs of a variable and its derivative that make up the named system."""
+    """Return the named system as pairs of a variable and its derivative."""
     size, field = FIELDS[name]
     variables = hy.make_vars(*(f"y{i:02}" for i in range(size)))
     return list(zip(variables, field(variables), strict=True))
 
 
 def batch_size() -> int:
-    """How many members a batch has: the lanes of the host's vectors."""
+    """Return the number of members of a batch: the lanes of a vector of this CPU."""
     return hy.recommended_simd_size()
 
 
 def layouts(members: int, threads: int) -> list[str]:
-    """The ways to run so many members, those on threads if there are several.
+    """Return the names of the ways to run an ensemble.
 
-    Each is made of the words "single" or "batch", "ensemble" for
-    `ensemble_propagate_until` and "threads".
+    Each name consists of words: "single" or "batch", "ensemble" for
+    `ensemble_propagate_until`, and "threads", which is used only if `threads` > 1.
     """
     if members == 1:
         return ["single"]
@@ -99,7 +104,7 @@ def layouts(members: int, threads: int) -> list[str]:
 
 
 def _into_batches(y: np.ndarray) -> np.ndarray:
-    """(members, n) as (batches, n, lanes), filled up with the last member."""
+    """Reshape (members, n) to (batches, n, lanes), padded with the last member."""
     lanes = batch_size()
     filled = np.concatenate([y, np.repeat(y[-1:], -len(y) % lanes, axis=0)])
     batches = filled.reshape(-1, lanes, y.shape[-1])
@@ -107,7 +112,7 @@ def _into_batches(y: np.ndarray) -> np.ndarray:
 
 
 def _from_batches(y: np.ndarray, members: int) -> np.ndarray:
-    """Undo `_into_batches`."""
+    """Reshape (batches, n, lanes) to (members, n), without the padding."""
     return y.swapaxes(1, 2).reshape(-1, y.shape[1])[:members]
 
 
@@ -120,7 +125,7 @@ def _restart(integrator: Any, start: np.ndarray) -> None:
 
 
 def _one_by_one(t: float, integrator: Any, starts: np.ndarray) -> np.ndarray:
-    """The ends of all starts, members or batches, by one integrator."""
+    """Integrate from each start, a member or a batch, with one integrator."""
     ends = np.empty_like(starts)
     for start, end in zip(starts, ends, strict=True):
         _restart(integrator, start)
@@ -135,7 +140,7 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def _on_threads(t: float, integrators: list[Any], starts: np.ndarray) -> np.ndarray:
-    """The same with a thread and a share of the starts for each integrator."""
+    """Integrate from all starts, with a thread and a share of them per integrator."""
     shares = np.array_split(starts, len(integrators))
     ends = _pool(len(integrators)).map(partial(_one_by_one, t), integrators, shares)
     return np.concatenate(list(ends))
@@ -144,7 +149,7 @@ def _on_threads(t: float, integrators: list[Any], starts: np.ndarray) -> np.ndar
 def _as_ensemble(
     t: float, integrator: Any, starts: np.ndarray, threads: int
 ) -> np.ndarray:
-    """The same by heyoka's own function for ensembles."""
+    """Integrate from all starts by heyoka's own function for ensembles."""
     batched = starts.ndim == 3
     run = hy.ensemble_propagate_until_batch if batched else hy.ensemble_propagate_until
 
@@ -159,10 +164,10 @@ def _as_ensemble(
 def heyoka_run(
     name: str, layout: str, y0: np.ndarray, t: float, threads: int = 1
 ) -> Callable[[float], tuple[Callable[[], np.ndarray], float]]:
-    """What makes, for a tolerance, a run and the seconds of compiling its integrator.
+    """Create a function from a tolerance to a run and its compile time in seconds.
 
-    The run returns the end states of all members, shape (members, n), as `y0`. It has
-    one thread unless "threads" is in the layout.
+    The run returns the states of all members at the end, in the shape (members, n) of
+    `y0`. It uses one thread unless the layout contains "threads".
     """
     words = layout.split()
     threads = threads if "threads" in words else 1

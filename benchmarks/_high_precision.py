@@ -1,7 +1,7 @@
-"""Functions of JAX evaluated in 50 digits, by an interpreter of their programs.
+"""Evaluation of JAX functions in 50 digits, by an interpreter of their jaxprs.
 
-Arrays of floating-point numbers become arrays of mpmath's numbers. Operations that only
-move numbers, such as a transposition, are done by JAX on the indices of the numbers.
+Arrays of floating-point numbers become arrays of mpmath numbers. If an operation only
+moves numbers, such as a transposition, JAX applies it to their indices.
 """
 
 import math
@@ -25,7 +25,7 @@ _MP.dps = DIGITS
 
 
 def _each(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Apply a function of numbers to arrays of them."""
+    """Return a function that applies `function` to each entry of arrays."""
     on_arrays = np.frompyfunc(function, function.__code__.co_argcount, 1)
     return lambda *arrays: np.asarray(on_arrays(*arrays), object)
 
@@ -102,7 +102,8 @@ _MOVES = {
 def evaluate(function: Callable[..., Any], *arguments: Any) -> Any:
     """Evaluate a function of JAX at float64 arguments, in `DIGITS` digits.
 
-    The result is a tree of NumPy arrays, those of floating-point numbers of mpmath's.
+    The result is a tree of NumPy arrays. Floating-point numbers in it are mpmath
+    numbers.
     """
     program, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
     leaves = [_exact(np.asarray(x)) for x in jax.tree.leaves(arguments)]
@@ -111,7 +112,7 @@ def evaluate(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def to_float(array: np.ndarray) -> np.ndarray:
-    """Round an array of mpmath's numbers to float64."""
+    """Round an array of mpmath numbers to float64."""
     return np.asarray(array, float)
 
 
@@ -211,7 +212,10 @@ def _by_jax(equation: Any, x: list) -> list:
 
 
 def _moved(equation: Any, x: list) -> list:
-    """Apply a primitive that moves numbers, to their places in a list of all."""
+    """Apply a primitive that only moves numbers.
+
+    JAX applies it to the places of the numbers in one list of all operands.
+    """
     pool, places = [], []
     for variable, y in zip(equation.invars, x, strict=True):
         if _is_float(variable):
@@ -234,7 +238,7 @@ def _moved(equation: Any, x: list) -> list:
 
 
 def _scatter_add(equation: Any, x: np.ndarray, places: np.ndarray, more: np.ndarray):
-    """Add updates to an array, by the matrix of zeros and ones that says where."""
+    """Add updates to an array, by a matrix of zeros and ones that maps their places."""
 
     def added(more: Array) -> Array:
         zero = jnp.zeros(x.shape)

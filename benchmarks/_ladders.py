@@ -1,6 +1,7 @@
-"""The runs that work-precision diagrams are made of: every solver's ladder.
+"""The runs of work-precision diagrams: a ladder of runs for each solver.
 
-A ladder is a method with step sizes or tolerances from coarse to fine.
+A ladder is the list of runs of one method with step sizes or tolerances from coarse to
+fine. A rung is one of these step sizes or tolerances.
 """
 
 import importlib.util
@@ -32,8 +33,9 @@ from ._competitors import (
 from ._contest import Run
 
 
-CHECKED = 101  # of a larger ensemble, so many members have a reference
-# Steps per 20 units of time, from where the error is visible to round-off.
+CHECKED = 101  # the number of members of a larger ensemble that have a reference
+# For each number of stages: numbers of steps for t = 20, from errors that a plot shows
+# to errors at round-off.
 LADDERS = {
     2: (100, 400, 1600),
     3: (50, 100, 200, 400, 800),
@@ -51,13 +53,13 @@ TOLERANCES = {
     "Radau": (1e-4, 1e-6, 1e-8, 1e-10, 1e-12),
     "IDA": (1e-5, 1e-7, 1e-9, 1e-11),
 }
-# Of the increments of nhjax's simplified Newton iteration; 0 is to round-off.
+# Tolerances of nhjax's `SimplifiedNewton`; with 0, stages are solved to round-off.
 NEWTON_TOLERANCES = (0.0, 1e-6, 1e-7, 1e-9, 1e-10, 1e-12)
 STEPS = (0.4, 0.2, 0.1, 0.05, 0.025)
 
 
 class Case:
-    """One system, time and number of members, with what its runs are judged by."""
+    """A system, a time and a number of members, with the reference for its runs."""
 
     def __init__(self, name: str, t: float, members: int):
         self.name, self.t, self.members = name, t, members
@@ -70,9 +72,10 @@ class Case:
         self.reference = self._reference()
 
     def _reference(self) -> np.ndarray | None:
-        """(q, v) of the checked members at the end, as far as it can be known."""
-        # A perturbation grows up to 10⁵-fold by t = 50, and by t = 200 as far as the
-        # motion goes: no trajectory can be followed for long.
+        """Return (q, v) of the checked members at the end, or None if it is unknown."""
+        # In the chaotic system, perturbations grow by a factor of up to 10⁵ until
+        # t = 50, and until t = 200 to the size of the motion itself. Therefore long
+        # trajectories have no reference.
         if self.name == "chaotic" and self.t > 60:
             return None
         q, v = self.q[self.checked], self.v[self.checked]
@@ -84,7 +87,7 @@ class Case:
         return np.concatenate(self.problem.from_state(end), -1)
 
     def judge(self, run: Run, q: np.ndarray, v: np.ndarray) -> None:
-        """Fill in what (q, v) at the end, of all members, say of the run."""
+        """Compute the errors of a run from (q, v) of all members at the end."""
         if not (np.all(np.isfinite(q)) and np.all(np.isfinite(v))):
             return
         if self.reference is not None:
@@ -104,15 +107,16 @@ class Case:
 
 
 def thinned(ladder: tuple, limit: int) -> list:
-    """At most so many rungs, with the first and the last."""
+    """Return at most `limit` rungs of a ladder, including the first and the last."""
     if len(ladder) <= limit:
         return list(ladder)
     return [ladder[round(i)] for i in np.linspace(0, len(ladder) - 1, limit)]
 
 
 def compiled(function: Callable, args: tuple) -> tuple[Callable[..., Any], float]:
-    """The compiled program, and the seconds of its first call."""
-    # Not compiled ahead of time: calls of such programs cost ten times as much.
+    """Return a compiled program, and the seconds of its first call."""
+    # The program is not compiled ahead of time, because each call of such a program has
+    # ten times the overhead.
     program = jax.jit(function)
     start = time.perf_counter()
     jax.block_until_ready(program(*args))
@@ -120,9 +124,10 @@ def compiled(function: Callable, args: tuple) -> tuple[Callable[..., Any], float
 
 
 def nhjax_runs(case: Case, stages: tuple[int, ...], limit: int) -> Iterator[Run]:
-    """The ladder of each s; steps that cannot be solved are left out.
+    """Yield the ladders of nhjax, for each number of stages s.
 
-    Each with the stages solved to round-off, and to tolerances that suit the errors.
+    Each step size is run with stages solved to round-off, and with several larger
+    tolerances. Runs with a step that cannot be solved are omitted.
     """
     system = case.problem.example.system
     y0 = jax.vmap(lambda q, v: nhjax.initial_state(system, q, v))(case.q, case.v)
@@ -169,7 +174,10 @@ def nhjax_runs(case: Case, stages: tuple[int, ...], limit: int) -> Iterator[Run]
 
 
 def spread(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of an ensemble and of a tolerance, its members over all devices."""
+    """Spread the members of an ensemble over all devices.
+
+    The functions take the ensemble and a tolerance.
+    """
     mesh = Mesh(np.asarray(jax.devices()), ("members",))
     members, everywhere = PartitionSpec("members"), PartitionSpec()
     shared = jax.shard_map(
@@ -193,10 +201,11 @@ def spread(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def diffrax_runs(case: Case, limit: int) -> Iterator[Run]:
-    """Adaptive steps, and for Dopri8 fixed ones too."""
+    """Yield the ladders of diffrax: adaptive steps, and for Dopri8 also fixed steps."""
     methods = [("Tsit5", False), ("Dopri8", False), ("Dopri8", True)]
     layouts = ["array"] if case.members == 1 else ["vmap", "stacked"]
-    # Its Newton iterations make it a hundred times slower than the explicit methods.
+    # Kvaerno5 runs only in short cases, because its Newton iterations make it a hundred
+    # times slower than the explicit methods.
     if case.members == 1 and case.t <= 20:
         methods.append(("Kvaerno5", False))
     y0 = case.problem.to_state(case.q, case.v)
@@ -218,16 +227,17 @@ def diffrax_runs(case: Case, limit: int) -> Iterator[Run]:
 
 
 def cores() -> int:
-    """How many cores this process may use."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def heyoka_runs(case: Case, limit: int, longest: float) -> Iterator[Run]:
-    """Its layouts, nothing where heyoka is not installed.
+    """Yield the ladders of heyoka for each layout; none if heyoka is not installed.
 
-    A ladder of `ensemble_propagate_until` ends where a run takes too long.
+    A ladder of `ensemble_propagate_until` ends at the first run that takes longer than
+    `longest` seconds.
     """
     if importlib.util.find_spec("heyoka") is None:
         return
@@ -237,8 +247,8 @@ def heyoka_runs(case: Case, limit: int, longest: float) -> Iterator[Run]:
     threads = min(2, cores())
     for layout in _heyoka.layouts(case.members, threads):
         prepare = _heyoka.heyoka_run(case.name, layout, y0, case.t, threads)
-        # The time grows unlike a power of the error: with few rungs, interpolated
-        # times would be too short.
+        # Times are interpolated as powers of the error. The times of heyoka are not
+        # powers: with few rungs, interpolated times would be too short.
         number = 3 if "ensemble" in layout else max(limit, 6)
         for tolerance in thinned(_heyoka.TOLERANCES, number):
             call, seconds = prepare(tolerance)
@@ -255,7 +265,7 @@ def heyoka_runs(case: Case, limit: int, longest: float) -> Iterator[Run]:
 
 
 def heyoka_note() -> str:
-    """Version and sizes that the times of heyoka depend on."""
+    """Write the version of heyoka, its batch size and the number of threads."""
     if importlib.util.find_spec("heyoka") is None:
         return "heyoka is not installed."
     from . import _heyoka
@@ -271,7 +281,10 @@ def _blocked(program: Callable, *args: Any) -> Any:
 def host_runs(
     case: Case, field: HostField, form: str, limit: int, longest: float
 ) -> Iterator[Run]:
-    """SciPy and IDA, one trajectory; a ladder ends where a run takes too long."""
+    """Yield the ladders of SciPy and IDA, for one trajectory.
+
+    A ladder ends at the first run that takes longer than `longest` seconds.
+    """
     q, v = case.q[0], case.v[0]
     y0 = case.problem.to_state(q, v)
     solvers: dict[str, tuple[Callable[[float], Any], tuple]] = {

@@ -1,5 +1,5 @@
-"""Ten systems that nobody has chosen: mass matrices that depend on the position, both
-kinds of constraint, forces that depend on time and velocity, and groups.
+"""Ten random systems: mass matrices that depend on the position, both kinds of
+constraint, forces that depend on time and velocity, and groups.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,13 @@ import nhjax
 
 
 class Shape(NamedTuple):
-    """Numbers of coordinates, nonholonomic and holonomic constraints; the manifold."""
+    """The shape of a system.
+
+    - `n`, `m`, `k`: the numbers of coordinates, nonholonomic constraints and holonomic
+        constraints.
+    - `driven`: whether the system has a force.
+    - `manifold`: its group, or None for a vector space.
+    """
 
     name: str
     n: int
@@ -24,7 +30,7 @@ class Shape(NamedTuple):
 
 
 def shapes() -> list[Shape]:
-    """What the ten systems have."""
+    """Return the shapes of the ten systems."""
     plane = nhjax.Euclidean(2)
     return [
         Shape("random 2", 2),
@@ -49,7 +55,7 @@ def shapes() -> list[Shape]:
 def random_system(
     shape: Shape, seed: int
 ) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
-    """A system of that shape, and a consistent state of it."""
+    """Create a random system of a shape, and a consistent state of this system."""
     generator = np.random.default_rng(seed)
     n, m, k = shape.n, shape.m, shape.k
     manifold = nhjax.Euclidean(n) if shape.manifold is None else shape.manifold
@@ -84,7 +90,7 @@ def random_system(
         return 0.3 * jnp.sin(2 * t) * jnp.cos(jnp.arange(n)) - friction * v
 
     q = manifold.act(start, jnp.asarray(0.3 * generator.standard_normal(n)))
-    # The constraint is the level of the start.
+    # The holonomic constraint is the level set of the functions `level` through q.
     height = level(q) if k else 0.0
     system = nhjax.LagrangianSystem(
         lagrangian,
@@ -98,11 +104,10 @@ def random_system(
 
 
 def coordinates(q: PyTree[Array]) -> Array:
-    """Return the numbers of a configuration as a vector, with the cosine and the sine
-    of the angle of a pose.
+    """Return the numbers of a configuration as a vector.
 
-    Functions on SE(2) must have the period 2π in the angle, from which nhjax may
-    subtract turns.
+    In a pose of SE(2), the cosine and the sine replace the angle: nhjax may subtract
+    turns from the angle, so that functions of it must have the period 2π.
     """
     if not isinstance(q, tuple):
         return q.reshape(-1)
@@ -114,7 +119,7 @@ def coordinates(q: PyTree[Array]) -> Array:
 def random_systems(
     seed: int = 20,
 ) -> dict[str, Callable[[], tuple[nhjax.LagrangianSystem, nhjax.State]]]:
-    """The ten systems by their names."""
+    """Return the ten systems by their names."""
     return {
         shape.name: lambda shape=shape, k=k: random_system(shape, seed + k)
         for k, shape in enumerate(shapes())

@@ -1,4 +1,4 @@
-"""A reference that shares no time stepping with nhjax."""
+"""A reference solution whose time steps do not use nhjax."""
 
 import equinox as eqx
 import jax
@@ -12,10 +12,10 @@ import nhjax
 def reference(
     system: nhjax.LagrangianSystem, y0: nhjax.State, t: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(q, v) at time t by DOP853 on the index-reduced equations of motion.
+    """Compute (q, v) at time t by DOP853 on the index-reduced equations of motion.
 
-    They are the equations M a - Bᵀλ = D1L + F - d/dt(D2L)|_a, B a = -dΦ/dt|_a solved
-    densely for (a, λ), with derivatives by autodiff.
+    The equations are M a - Bᵀλ = D1L + F - d/dt(D2L)|_{a=0} and B a = -dΦ/dt|_{a=0}, a
+    dense linear system for the acceleration a and λ. All derivatives are automatic.
     """
     n = y0.v.shape[0]
 

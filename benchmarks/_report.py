@@ -1,4 +1,4 @@
-"""How the benchmarks measure times, and where they put what they measured."""
+"""Functions by which the benchmarks measure times, and write and read reports."""
 
 import argparse
 import datetime
@@ -26,7 +26,7 @@ def least_time(
     rounds: int,
     clock: Callable[[], float] = time.perf_counter,
 ) -> float:
-    """Return the seconds of a call, the least of some rounds."""
+    """Call a function `rounds` times, and return the least time in seconds."""
     times = []
     for _ in range(rounds):
         start = clock()
@@ -38,7 +38,7 @@ def least_time(
 def from_fresh_process(
     name: str, *arguments: str, environment: Mapping[str, str] | None = None
 ) -> Any:
-    """Run a benchmark in a fresh process, and return the JSON of its last line."""
+    """Run a benchmark in a fresh process; return the JSON of its last printed line."""
     done = subprocess.run(
         [sys.executable, "-m", f"benchmarks.{name}", *arguments],
         env=os.environ | (environment or {}),
@@ -50,19 +50,19 @@ def from_fresh_process(
 
 
 def markdown_table(header: list[str], rows: list[list[str]]) -> str:
-    """A Markdown table, whose cells may hold bars, as |Φ| does."""
+    """Write a Markdown table; cells may contain bars, as in |Φ|."""
     lines = [header, ["---"] * len(header), *rows]
     cells = [[cell.replace("|", "\\|") for cell in line] for line in lines]
     return "\n".join("| " + " | ".join(line) + " |" for line in cells)
 
 
 def number(x: float) -> str:
-    """Two significant digits, as the tables need."""
+    """Format a number for the tables, with two significant digits."""
     return f"{x:.1e}"
 
 
 def _finite(x: Any) -> Any:
-    """`x` as JSON knows it: arrays as lists, infinities and NaN as None."""
+    """Convert `x` for JSON: arrays to lists, infinities and NaN to None."""
     if isinstance(x, np.ndarray | np.generic | jax.Array):
         x = x.tolist()
     if isinstance(x, dict):
@@ -73,7 +73,7 @@ def _finite(x: Any) -> Any:
 
 
 def write(name: str, title: str, text: str, data: dict[str, Any]) -> None:
-    """Print a report and keep it, as Markdown and JSON."""
+    """Print a report, and save it as Markdown and JSON."""
     about = {
         "date": datetime.date.today().isoformat(),
         "device": jax.devices()[0].device_kind,
@@ -101,9 +101,9 @@ def add_keep(parser: argparse.ArgumentParser) -> None:
 
 
 def with_saved(name: str, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the rows of a saved table, with new rows for the systems and stages.
+    """Return the rows of a saved table, updated by new rows.
 
-    A new row replaces the saved rows of its system and number of stages.
+    A new row replaces the saved rows with the same system and number of stages.
     """
     measured = {(row["system"], row["stages"]) for row in rows}
     saved = json.loads((RESULTS / f"{name}.json").read_text())["rows"]

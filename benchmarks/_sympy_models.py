@@ -1,7 +1,7 @@
-"""Rolling bodies written in SymPy, as its users would: what `from_sympy` is given.
+"""Rolling bodies written in SymPy, as models for `from_sympy`.
 
-The frames, parameters and sources are those of SymPy's tests and of PyDy's examples.
-Where a body is has coordinates here, and rolling is a constraint.
+The frames and parameters are taken from SymPy's tests and from PyDy's examples. In
+addition, the position of each body has coordinates here, and rolling is a constraint.
 """
 
 import math
@@ -24,7 +24,7 @@ import nhjax
 
 
 def particle() -> nhjax.SymPyModel:
-    """The nonholonomic particle of the gallery, with a spring as a parameter."""
+    """Create the nonholonomic particle of the gallery, with the stiffness as `k`."""
     x, y, z = dynamicsymbols("x y z")
     speeds = [q.diff() for q in (x, y, z)]
     k = symbols("k")
@@ -38,9 +38,11 @@ def particle() -> nhjax.SymPyModel:
 
 
 def rolling_disc() -> nhjax.SymPyModel:
-    """PyDy's rolling disc (examples/rollingdisc): z downward, yaw, lean and spin.
+    """Create PyDy's rolling disc (examples/rollingdisc).
 
-    The place of the contact is not in PyDy's model: its velocities roll already.
+    The z axis points down, and the angles are yaw, lean and spin. PyDy's model has no
+    coordinates for the contact, because its velocities satisfy the rolling conditions
+    by their definition. Here x and y are coordinates.
     """
     x, y, yaw, lean, spin = dynamicsymbols("x y q0 q1 q2")
     r, m, g, across, axial = symbols("r m g I J")
@@ -67,10 +69,11 @@ def rolling_disc() -> nhjax.SymPyModel:
 
 
 def rattleback() -> nhjax.SymPyModel:
-    """PyDy's rattleback (examples/rattleback, the ellipsoid): z downward.
+    """Create PyDy's rattleback (examples/rattleback, the ellipsoid).
 
-    Yaw, lean and pitch, and the place of the centre of mass. The parameters are those
-    of Kane and Levinson (1982), as in PyDy's simulation.
+    The z axis points down. The coordinates are yaw, lean and pitch, and the position of
+    the centre of mass. The parameters are from Kane and Levinson (1982), as in PyDy's
+    simulation.
     """
     angles, place = dynamicsymbols("q0 q1 q2"), dynamicsymbols("x y z")
     a, b, c, f, m, g, s = symbols("a b c f m g s")
@@ -108,10 +111,11 @@ def rattleback() -> nhjax.SymPyModel:
 
 
 def bicycle_parameters() -> dict[str, float]:
-    """The benchmark of Meijaard et al. (2007) in the axes of SymPy's `test_kane3.py`.
+    """Return the parameters of Meijaard et al. (2007) for SymPy's `test_kane3.py`.
 
-    There the steer axis is an axis of the frame, from which lengths are measured along
-    and across it; products of inertia have the opposite signs.
+    In SymPy's model the steer axis is an axis of the frame of the bicycle, and lengths
+    are measured along and across the steer axis. Products of inertia have the opposite
+    signs.
     """
     rear, front, trail, base = 0.3, 0.35, 0.08, 1.02
     tilt = 0.5 * math.pi - math.pi / 10
@@ -137,10 +141,11 @@ def bicycle_parameters() -> dict[str, float]:
 
 
 def bicycle() -> nhjax.SymPyModel:
-    """The bicycle of SymPy's `test_kane3.py`: z upward, with all eight coordinates.
+    """Create the bicycle of SymPy's `test_kane3.py`, with all eight coordinates.
 
-    SymPy's model leaves out where the bicycle is and how its wheels have turned, and
-    the rear wheel rolls already in its velocities.
+    The z axis points up. SymPy's model has no coordinates for the position of the
+    bicycle and the turns of its wheels, and its velocities satisfy the rolling
+    conditions of the rear wheel by their definition.
     """
     x, y, yaw, lean, pitch, steer, rear_turn, front_turn = coordinates = dynamicsymbols(
         "x y q1 q2 q4 q5 q3 q6"
@@ -157,7 +162,7 @@ def bicycle() -> nhjax.SymPyModel:
     rear_wheel = frame.orientnew("WR", "Axis", [rear_turn, frame.y])
     front_wheel = fork.orientnew("WF", "Axis", [front_turn, fork.y])
 
-    # Points by their positions from the place where the rear wheel touches the ground.
+    # Positions of points relative to the contact point of the rear wheel.
     to_rear = of["rear_radius"] * rolled.z
     joint = to_rear + of["frame_length"] * frame.z
     to_frame = to_rear - of["frame_across"] * frame.x + of["frame_along"] * frame.z

@@ -1,4 +1,4 @@
-"""Tableaux other than Lobatto's and Gauss', and the orders that runs with them show."""
+"""Collocation methods other than Lobatto and Gauss, and their measured orders."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -14,13 +14,13 @@ from nhjax._numerics import max_norm
 def collocation(
     nodes: Sequence[float] | np.ndarray, closure: str = "consistent"
 ) -> nhjax.PartitionedRungeKutta:
-    """Make the collocation method with the given nodes, and its conjugate."""
+    """Create the collocation method with the given nodes, paired with its conjugate."""
     c = np.asarray(nodes, dtype=np.float64)
     powers = np.arange(1, c.size + 1)
     inverse = np.linalg.inv(np.vander(c, increasing=True))
     a, b = (c[:, None] ** powers / powers) @ inverse, (1 / powers) @ inverse
     if (c[0], c[-1]) == (0, 1):
-        # Exactly, as the hypotheses on systems with constraints ask for.
+        # Set the rows at the nodes 0 and 1 exactly, as hypotheses H1 and H3 require.
         a[0], a[-1] = 0.0, b
     return nhjax.PartitionedRungeKutta(a, b, closure=closure)
 
@@ -29,7 +29,7 @@ RK4 = nhjax.PartitionedRungeKutta(
     [[0, 0, 0, 0], [0.5, 0, 0, 0], [0, 0.5, 0, 0], [0, 0, 1, 0]],
     [1 / 6, 1 / 3, 1 / 3, 1 / 6],
 )
-# Nodes with both ends, for systems with constraints too.
+# Nodes that include both ends of the step, for systems with and without constraints.
 CLOSED = {
     "0, 1/3, 2/3, 1": (0, 1 / 3, 2 / 3, 1),
     "0, .25, .5, .75, 1": (0, 0.25, 0.5, 0.75, 1),
@@ -39,7 +39,7 @@ CLOSED = {
     "0, .35, .7, 1": (0, 0.35, 0.7, 1),
     "0, .1, .4, .6, .9, 1": (0, 0.1, 0.4, 0.6, 0.9, 1),
 }
-# Nodes without one of the ends.
+# Nodes that do not include both ends, for systems without constraints only.
 OPEN = {
     "Radau, s = 2": (1 / 3, 1),
     "1/4, 3/4": (0.25, 0.75),
@@ -48,7 +48,7 @@ OPEN = {
 
 
 class Slopes(NamedTuple):
-    """Observed orders in q, p and the multiplier, which is nan without constraints."""
+    """Observed orders of q, p and the multiplier; NaN for a missing multiplier."""
 
     q: float
     p: float
@@ -56,7 +56,7 @@ class Slopes(NamedTuple):
 
 
 def pendulum() -> tuple[nhjax.LagrangianSystem, nhjax.State]:
-    """A pendulum on a slide, whose mass depends on q; without constraints."""
+    """Create a pendulum on a slide: its mass matrix depends on q; no constraints."""
 
     def lagrangian(t, q, v, args):
         mixed = 0.6 * jnp.cos(q[1]) * v[0] * v[1]
@@ -68,7 +68,10 @@ def pendulum() -> tuple[nhjax.LagrangianSystem, nhjax.State]:
 
 
 def rolling(quadratic: float = 0.2) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
-    """A mass that depends on q; the constraint has a term that is quadratic in v."""
+    """Create a system with a mass that depends on q, and one nonholonomic constraint.
+
+    The constraint has a term that is quadratic in v, with the factor `quadratic`.
+    """
 
     def lagrangian(t, q, v, args):
         return (

@@ -1,9 +1,9 @@
-"""Ensembles on an accelerator beside the processor of the same machine.
+"""Ensembles on an accelerator, compared with the processor of the same machine.
 
-Each ensemble is one compiled `jax.vmap(integrate)`. The table has the time of a step
-and member on both devices, and how far apart the final positions are, relative to the
-largest: the chaotic system multiplies differences of round-off. Times are the least of
-three calls; compile time is separate.
+Each ensemble is one compiled `jax.vmap(integrate)`. The table has the time per step and
+member on both devices. It also has the largest difference between the final positions
+on both devices, relative to the largest position. In the chaotic system, differences of
+round-off grow. Times are the least of three calls; compile time is separate.
 
     python -m benchmarks.accelerators
 """
@@ -32,7 +32,7 @@ largest difference between the final positions of both."""
 
 
 class Ensemble(NamedTuple):
-    """A system, a method with its step, and the start of each member."""
+    """A system, a method with its step size, and the initial state of each member."""
 
     name: str
     system: nhjax.LagrangianSystem
@@ -44,7 +44,7 @@ class Ensemble(NamedTuple):
 
 
 def ensembles(dtype: Any) -> list[Ensemble]:
-    """The ensembles that are measured."""
+    """Return the ensembles that are measured."""
     chaotic = systems.ChaoticSystem()
     bicycle = systems.WhippleBicycle.running(lean_rate=0.5)
     default, lobatto = nhjax.SimplifiedNewton(), nhjax.LobattoIIIAB
@@ -56,7 +56,8 @@ def ensembles(dtype: Any) -> list[Ensemble]:
 
     def running(members):
         y0 = jax.tree.map(lambda x: jnp.asarray(x, dtype), bicycle.initial_state())
-        # Speeds of 95 to 105 percent, at which the constraints still hold.
+        # Scaling all velocities, here to 95 to 105 percent, keeps the constraints
+        # satisfied, because they are linear in v.
         scales = jnp.linspace(0.95, 1.05, members, dtype=dtype)
         return jax.vmap(
             lambda scale: nhjax.initial_state(bicycle.system, y0.q, scale * y0.v)
@@ -79,7 +80,11 @@ def ensembles(dtype: Any) -> list[Ensemble]:
 
 
 def program(ensemble: Ensemble) -> Any:
-    """The compiled ensemble: final positions, success, iterations and steps."""
+    """Return the compiled ensemble, a function of the initial states.
+
+    For each member it returns the final positions, whether the run succeeded, and the
+    numbers of iterations and steps.
+    """
     steps: dict[str, Any] = {"dt": ensemble.h, "num_steps": NUM_STEPS}
     if not isinstance(ensemble.controller, nhjax.ConstantStepSize):
         steps = {"t1": NUM_STEPS * ensemble.h, "max_steps": 10 * NUM_STEPS}
@@ -104,7 +109,7 @@ def program(ensemble: Ensemble) -> Any:
 
 
 def measure(ensemble: Ensemble, members: int) -> dict[str, Any]:
-    """Times of an ensemble on the default device and on the processor."""
+    """Measure an ensemble on the default device and on the processor."""
     devices = {"accelerator": jax.devices()[0], "cpu": jax.devices("cpu")[0]}
     found: dict[str, Any] = {"name": ensemble.name, "members": members}
     positions = {}
@@ -126,7 +131,7 @@ def measure(ensemble: Ensemble, members: int) -> dict[str, Any]:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """The figures of all ensembles."""
+    """Write the table of all ensembles."""
     lines = [
         [
             row["name"],

@@ -1,41 +1,47 @@
 """Search for accepted steps that are not solved, and for refused starts that are good.
 
-`--only steps`: every system of the gallery, a bicycle and ten random systems, with
-steps from h = 0.004 up to failure, by `SimplifiedNewton` and by `Newton` from the same
-states; then single steps from many states of systems with steep potentials, and of a
-body in a chart that it may leave. An accepted step is judged by three figures that are
-computed here: the residual of the stage equations at the stages found, relative to the
-size of its terms; the violation of the constraints at the end, relative to the size of
-their terms; and the distance between the ends of the two solvers. Where one solver
-alone accepts a step, the distance is the change of its stages in one more iteration of
-Newton's method.
+`--only steps` runs the systems of the gallery, a bicycle and ten random systems, with
+step sizes from h = 0.004 up to failure. `SimplifiedNewton` and `Newton` solve the same
+steps from the same states. It then takes single steps from many states of systems with
+steep potentials, and of a body in a chart that the step may leave. An accepted step is
+judged by three figures that are computed here:
 
-Doubtful steps are judged once more: accepted steps with a residual above 1e-13, or with
-an end that differs by more than 1e-11. Newton's method takes them again from states
-of which one number is moved by one unit in the last place. The sum of the distances by
-which this moves the end is the floor, at least the unit round-off: float64 does not
-know a start better. A step is solved if its end is within 400 floors, because the
-solvers treat 400 units of round-off as noise. The other steps are solved too if their
-residual is at most 1e-13. If their ends differ by more than 1e-3, the equations have
-two solutions. Otherwise their Jacobian is nearly singular. Where the coordinates are so
-large that the distance overflows, the residual decides. All other doubtful steps are
-wrongly accepted.
+- the residual of the stage equations at the computed stages, relative to the size of
+  its terms;
+- the violation of the constraints at the end, relative to the size of their terms;
+- the distance between the states that the two solvers find at the end of the step. If
+  only one solver accepts the step, the distance is the change of its stages in one more
+  iteration of Newton's method.
+
+Accepted steps with a residual above 1e-13, or with a distance of more than 1e-11, are
+doubtful and are judged again. Newton's method solves such a step again from other
+starts: in each of them one number of the start is moved by one unit in the last place.
+The sum of the distances by which these moves change the end is called the floor, and is
+at least the unit round-off. A float64 start is not known more accurately than this. A
+step is solved if its distance is within 400 floors, because the solvers treat 400 units
+of round-off as noise. The other doubtful steps are solved too if their residual is at
+most 1e-13. In this case the equations have two solutions if the distance is more than
+1e-3; otherwise their Jacobian is nearly singular. If the coordinates are so large that
+the distance overflows, the residual decides. All other doubtful steps are wrongly
+accepted.
 
 The terms of an equation r(x; q) = 0 have the size |∂r/∂x| |x| + |∂r/∂q| |q|, where |x|
-is the largest velocity, the largest multiplier and so on. No residual smaller than this
-size times the unit round-off can be demanded (Oettli and Prager, 1964). An acceleration
-counts by its effect in a step: |u̇| is at least |u| / h.
+has the largest absolute value of each kind of unknowns: of the velocities, of the
+multipliers and so on. A residual below this size times the unit round-off cannot be
+required (Oettli and Prager, 1964). An acceleration counts by its effect in a step: its
+size |u̇| is at least |u| / h.
 
-`--only starts`: how often `initial_state(..., project=True)` refuses a state near the
-constraints. Every system of the gallery with constraints gets states that are off by 0
-to 1e-2 in random directions: in q (in its entries, as rounding would change them, and
-along the group), in v, and in v at rest. None may be refused below 1e-3. Unit vectors
-rounded to ten digits are a case of their own.
+`--only starts` counts how often `initial_state(..., project=True)` refuses a state near
+the constraints. Each system of the gallery with constraints gets states that are moved
+by 0 to 1e-2 in random directions: in q or in v, also for states at rest. There are two
+ways to move q: by its entries, as rounding would, and along the group. States moved by
+less than 1e-3 must not be refused. A separate test uses unit vectors that are rounded
+to ten digits.
 
-`--only near_zero`: starts near zero of systems whose constraints contain constants. The
+`--only near_zero` uses states near zero, for constraints that contain constants. The
 true round-off of a constraint at a state is the largest difference between its value in
 float64 and in 50 digits, at nine states nearby. `initial_state` gets states that
-violate the constraint by 0, 10 and 1000 of these units, without projection.
+violate the constraint by 0, 10 and 1000 times this round-off, without projection.
 """
 
 import argparse
@@ -78,13 +84,13 @@ from ._report import add_keep, markdown_table, number, RESULTS, with_saved, writ
 SMALLEST, LARGEST, SIZES = 0.004, 4.0, 10
 ALLOWED, SAME, FAR = 1e-13, 1e-11, 1e-3
 JUDGEMENTS = "at the floor", "two solutions", "nearly singular", "overflow", "wrong"
-# More stages than these take many minutes to compile.
+# The largest numbers of stages: programs with more stages take many minutes to compile.
 MOST_STAGES = {"Whipple bicycle": 3}
 NUDGE = 2.0**-26
 
 
 def gallery() -> dict[str, Callable]:
-    """The systems of the gallery, each with a state to start from."""
+    """Return systems of the gallery by name, each with an initial state."""
     cvt = systems.ContinuouslyVariableTransmission
     named = {"CVT low": cvt.low, "CVT high": cvt.high}
     others = [
@@ -123,7 +129,7 @@ class Judged(NamedTuple):
 
 
 class Row(NamedTuple):
-    """Both solvers on one step, and how far apart their ends are."""
+    """One step by both solvers, and the distance between the two ends."""
 
     start: nhjax.State
     simplified: Judged
@@ -143,7 +149,7 @@ def compared(
 
 
 def judge(stages: StageEquations, outcome: StepOutcome) -> Judged:
-    """The figures of a step, from the stages and the state that were found."""
+    """Compute the figures of a step from its computed stages and its end."""
     residual, correction = residual_and_correction(stages, outcome.stages)
     return Judged(
         jnp.asarray(outcome.result._value),
@@ -157,8 +163,11 @@ def judge(stages: StageEquations, outcome: StepOutcome) -> Judged:
 def residual_and_correction(
     stages: StageEquations, x: StageUnknowns
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The largest residual of the stage equations over the size of its terms, and how
-    far Newton's method would move the velocities, relative to their size.
+    """Compute the relative residual of the stage equations, and a Newton correction.
+
+    The residual is the largest ratio of an equation's residual to the size of its
+    terms. The correction is the change of the velocities in one step of Newton's
+    method, relative to their size.
     """
     z, unravel = ravel_pytree(x)
 
@@ -170,7 +179,8 @@ def residual_and_correction(
     moved = equations(z, with_moved_positions(stages, jnp.asarray(NUDGE)))
     sizes = block_sizes(stages, x)
     terms = jnp.abs(jacobian) @ sizes + jnp.abs(moved - r) / NUDGE
-    # In units of its terms and unknowns, the system neither over- nor underflows.
+    # Equations are divided by the sizes of their terms, and unknowns by their sizes, so
+    # that the linear system neither overflows nor underflows.
     rows, columns = nonzero_or_one(terms), nonzero_or_one(sizes)
     scaled = jacobian * columns[None] / rows[:, None]
     change = unravel(columns * jnp.linalg.solve(scaled, -r / rows))
@@ -181,7 +191,7 @@ def residual_and_correction(
 
 
 def block_sizes(stages: StageEquations, x: StageUnknowns) -> Float[Array, " k"]:
-    """For each unknown the size of the largest of its kind."""
+    """Return, for each unknown, the largest absolute value of its kind."""
     sizes = jax.tree.map(max_norm, x)
     slowest = sizes.node_fibre_coordinate / jnp.abs(stages.h)
     sizes = eqx.tree_at(
@@ -195,7 +205,10 @@ def block_sizes(stages: StageEquations, x: StageUnknowns) -> Float[Array, " k"]:
 def relative_violation(
     stages: StageEquations, step_state: StepState
 ) -> Float[Array, ""]:
-    """The largest violation of a constraint at the end over the size of its terms."""
+    """Compute the largest ratio of a constraint's violation to the size of its terms.
+
+    The constraints are evaluated at the end of the step.
+    """
     system, t, args = stages.system, stages.t + stages.h, stages.args
     q, u = step_state.state.q, system.fibre_coordinate(step_state.state)
     manifold = system.manifold_of(q)
@@ -219,7 +232,7 @@ def relative_violation(
 
 
 def largest_ratio(x: Array, scale: Array) -> Float[Array, ""]:
-    """max |x| / scale, in which nothing over nothing is nothing."""
+    """Compute max |x| / scale, where 0 / 0 counts as 0."""
     return jnp.max(jnp.abs(x) / jnp.where(x == 0, 1, scale), initial=0)
 
 
@@ -231,7 +244,11 @@ def run(
     sizes: Float[Array, " k"],
     num_steps: int,
 ) -> tuple[Row, Array]:
-    """`num_steps` steps of each size, and whether the run was alive before each."""
+    """Take `num_steps` steps of each size with both solvers.
+
+    Also returns, for each step, whether all steps before it were accepted by at least
+    one solver.
+    """
     solvers = nhjax.SimplifiedNewton(), nhjax.Newton()
     go_on = jnp.asarray(False)
 
@@ -245,7 +262,7 @@ def run(
             )
             row = compared(step_state.state, stages, first, second)
             good = first.result == nhjax.RESULTS.successful
-            # Where the faster solver fails, the run goes on with the other one.
+            # If `SimplifiedNewton` fails, the run continues with the end of `Newton`.
             other = second.result == nhjax.RESULTS.successful
             step_state = jax.tree.map(
                 lambda old, a, b: jnp.where(good, a, jnp.where(other, b, old)),
@@ -271,7 +288,7 @@ def single_steps(
     starts: nhjax.State,
     sizes: Float[Array, " k"],
 ) -> Row:
-    """A step of its own size from each of the states, by both solvers."""
+    """Take one step from each state with both solvers; each state has its own size."""
     go_on = jnp.asarray(False)
     solvers = nhjax.SimplifiedNewton(), nhjax.Newton()
 
@@ -285,7 +302,10 @@ def single_steps(
 
 
 def steep_systems() -> dict[str, tuple[nhjax.LagrangianSystem, Callable]]:
-    """Systems that lead iterations astray, each with a draw of configurations."""
+    """Return systems for which iterations are difficult, with random configurations.
+
+    The second entry is a function of (generator, k) that draws k configurations.
+    """
 
     def particle(potential):
         return nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v - potential(q))
@@ -315,7 +335,7 @@ def steep_systems() -> dict[str, tuple[nhjax.LagrangianSystem, Callable]]:
 
 
 def measure_starts(name: str, stages: int, number: int, seed: int = 0) -> dict:
-    """The figures of single steps from many states, h from 1e-3 to 3."""
+    """Measure single steps from `number` random states, with h from 1e-3 to 3."""
     system, draw = steep_systems()[name]
     generator = np.random.default_rng(seed)
     q = draw(generator, number)
@@ -331,7 +351,7 @@ def measure_starts(name: str, stages: int, number: int, seed: int = 0) -> dict:
 
 
 def apart(first: StepOutcome, second: StepOutcome) -> Float[Array, ""]:
-    """The distance of two ends, relative to their size."""
+    """Compute the distance between the ends of two steps, relative to their size."""
     parts = []
     for name in ("q", "p"):
         a, b = (
@@ -358,13 +378,16 @@ def accepted_steps(rows: Row, alive: np.ndarray) -> list[np.ndarray]:
 
 
 def distances(rows: Row, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return how far apart two accepted ends are, or how far one would still move."""
+    """Return the distances between ends that both solvers accept.
+
+    If only one solver accepts a step, the distance is its Newton correction.
+    """
     alone = np.where(first, rows.simplified.correction, rows.newton.correction)
     return np.where(first & second, rows.distance, alone)
 
 
 def table_row(rows: Row, alive: np.ndarray) -> dict[str, float | int]:
-    """Counts of what became of the steps, and the worst figures of accepted ones."""
+    """Count the results of the steps, and find the worst figures of accepted steps."""
     figures: dict[str, float | int] = {}
     first, second = accepted_steps(rows, alive)
     for name, judged, good in (
@@ -383,7 +406,7 @@ def table_row(rows: Row, alive: np.ndarray) -> dict[str, float | int]:
             figures[f"{name} {figure}"] = float(np.max(values, initial=0))
     distance = distances(rows, first, second)[first | second]
     figures["distance"] = float(np.max(distance, initial=0))
-    # What is not a number is not the same either.
+    # A distance that is NaN counts as a difference.
     figures["apart"] = int(np.sum(~(distance <= SAME)))
     return figures
 
@@ -433,11 +456,12 @@ def moved_by_last_digit(
     start: nhjax.State,
     h: Float[Array, ""],
 ) -> Float[Array, ""]:
-    """How far a step ends from another that starts one unit in the last place away.
+    """Compute how far the end of a step moves if its start moves by one last digit.
 
-    Each number of the start that is not zero is moved alone, and the distances,
-    relative to the size of the end, are added. Moves of several numbers at once can
-    cancel: if both ends of a rod move alike, its direction stays.
+    Each nonzero number of the start is moved alone by one unit in the last place. The
+    resulting distances between ends, relative to the size of the end, are added. The
+    numbers are not moved together, because their effects can cancel: if both ends of a
+    rod move by the same vector, its direction does not change.
     """
     z, unravel = ravel_pytree(start)
     moves = jnp.asarray(np.eye(len(z) + 1, len(z), -1))
@@ -457,7 +481,7 @@ def moved_by_last_digit(
 
 
 def measure(name: str, stages: int, make: Callable, num_steps: int) -> dict:
-    """The figures of one system and one number of stages."""
+    """Measure the steps of one system with one number of stages."""
     system, y0 = make()
     sizes = jnp.asarray(np.geomspace(SMALLEST, LARGEST, SIZES))
     method = nhjax.LobattoIIIAB(stages)
@@ -518,7 +542,10 @@ def disturbed(
 
 
 def kinds(example: AbstractExample) -> list[str]:
-    """List what may be off; at rest only where constraints are linear in v."""
+    """List the parts of the state that are disturbed.
+
+    States at rest are used only if the constraints are linear in v.
+    """
     flat = example.system.manifold_of(example.q0).is_flat
     along = [] if flat else ["q, along the group"]
     rest = [] if isinstance(example, systems.Appell) else ["v, at rest", "q, at rest"]
@@ -530,7 +557,7 @@ def refused(start: Callable[..., nhjax.State], *given: Any) -> bool:
     try:
         y = start(*given)
         return not all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(y))
-    except (RuntimeError, ValueError):  # JAX chooses which of them
+    except (RuntimeError, ValueError):  # JAX may raise either of them
         return True
 
 
@@ -605,13 +632,13 @@ class Case(NamedTuple):
 
 
 def _wheel(q):
-    """The height of a wheel of 0.3 m, upright except for a lean and a pitch."""
+    """Compute the height of a wheel of radius 0.3 m with a small lean and pitch."""
     axle = jnp.sin(q[1]) * jnp.cos(q[2])
     return q[0] + 0.3 - 0.3 * jnp.sqrt(1 - axle**2)
 
 
 def _beside_a_constant(q):
-    """Numbers that are added to 100 before they are squared."""
+    """Compute a constraint in which a small number is added to 100, and squared."""
     return ((100 + q[1] / 100) ** 2 - 100**2) * jnp.cos(q[2]) - q[0]
 
 
@@ -675,7 +702,7 @@ def count_near_zero(case: Case, number: int) -> list[dict[str, Any]]:
 
 def measure_steps(options: argparse.Namespace) -> list[dict]:
     """Measure the steps of the systems and stages that the options ask for."""
-    # The programs run for seconds and would be optimised for minutes.
+    # The programs run only for seconds, but optimising them would take minutes.
     jax.config.update("jax_disable_most_optimizations", True)
     wanted = options.systems or [""]
     makers = {
@@ -704,7 +731,7 @@ PARTS = ("steps", "starts", "near_zero")
 
 
 def main() -> None:
-    """Measure the parts asked for, and save them with what was saved of the others."""
+    """Measure the requested parts, and save them with the saved data of the others."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -723,7 +750,7 @@ def main() -> None:
     add_keep(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    # Otherwise each refusal writes a line.
+    # Otherwise JAX logs a line for each refusal.
     logging.getLogger("jax._src.callback").disabled = True
     path = RESULTS / "acceptance.json"
     saved = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
@@ -772,7 +799,7 @@ def _cell(x: Any) -> str:
 
 
 def table_of_doubtful(data: list[dict]) -> str:
-    """Say how the doubtful steps are judged, with a table."""
+    """Return text and a table with the judgements of the doubtful steps."""
     found = [row for row in data if row.get("doubtful")]
     total = {key: sum(row["doubtful"][key] for row in found) for key in JUDGEMENTS}
     text = f"{sum(total.values())} steps are doubtful: "
@@ -786,7 +813,7 @@ def table_of_doubtful(data: list[dict]) -> str:
 
 
 def of_starts(starts: dict[str, Any]) -> str:
-    """Say how many starts are refused, with a table of the cases with refusals."""
+    """Return text on the number of refused starts, and a table of these cases."""
     rows = starts["rows"]
     worst = max(
         x
@@ -823,7 +850,7 @@ def table_near_zero(data: list[dict[str, Any]]) -> str:
 
 
 def summary(data: list[dict]) -> str:
-    """What the table comes to."""
+    """Summarise the table of steps in words."""
     worst = max(
         row[f"{solver} {figure}"] or 0.0
         for row in data

@@ -1,22 +1,24 @@
-"""Steps that adapt: error against steps and time, on motions with fast and slow phases.
+"""Adaptive steps: error against steps and time, for motions with fast and slow phases.
 
 Five motions have phases of very different speed: a rattleback that reverses its spin,
 Euler's disc down to an inclination of 1e-3, an orbit with close passes and a
-constraint, a whip of ten pendulums, and a bicycle that falls. Three are smooth, so that
-constant steps suit them. Each is run with constant steps, with the PID controller, and
-with the reversible controller. Beside them, where the equations are on a vector space,
-are diffrax with its PID controller on the index-reduced equations, and IDA of SUNDIALS
-on the equations with multipliers, with compiled residuals and Jacobians.
+constraint, a whip of ten pendulums, and a bicycle that falls. Three other motions are
+smooth, so that constant steps suit them. Each motion is run with constant steps, with
+the PID controller, and with the reversible controller. If the equations are on a vector
+space, two other solvers run them too: diffrax with its PID controller on the
+index-reduced equations, and IDA of SUNDIALS on the equations with multipliers, with
+compiled residuals and Jacobians.
 
-The error is the largest of (q, v) at the end against a run with s = 6 and the tolerance
-1e-12, over the size of the state. Steps are attempts, rejected ones included. Times are
-the least of three calls of compiled programs. For the comparison at equal error, the
-steps of a ladder are interpolated in logarithms.
+The error is the largest error of (q, v) at the end, relative to the size of the state.
+The reference is a run with s = 6 and the tolerance 1e-12. The number of steps includes
+rejected steps. Times are the least of three calls of compiled programs. For the
+comparison at equal error, the steps of a ladder (the runs of one method with different
+steps or tolerances) are interpolated in logarithms.
 
-More parts: `long` follows the energy of the orbit over t = 1e5 with constant, PID
-and reversible steps, and draws docs/step_sizes.png. `stages` measures which number of
-stages needs the least time for an error. `tolerance` compares errors with tolerances
-over the gallery, and draws docs/tolerances.png.
+There are three more parts. `long` follows the energy of the orbit over t = 1e5 with
+constant, PID and reversible steps, and draws docs/step_sizes.png. `stages` measures
+which number of stages needs the least time for an error. `tolerance` compares errors
+with tolerances for machines of the gallery, and draws docs/tolerances.png.
 """
 
 import argparse
@@ -53,7 +55,8 @@ class Case(NamedTuple):
 
     - `constant`: the numbers of constant steps.
     - `eps`: values of ε for the reversible controller.
-    - `density`: its density, or None for the automatic one.
+    - `density`: the step density of the reversible controller, or None for its
+        automatic density.
     - `is_smooth`: whether constant steps suit the motion.
     """
 
@@ -68,7 +71,7 @@ class Case(NamedTuple):
 
 
 def doubled(first: int, number: int) -> tuple[int, ...]:
-    """Return numbers of steps, each twice the one before."""
+    """Return `number` numbers of steps, each twice the number before it."""
     return tuple(first * 2**k for k in range(number))
 
 
@@ -134,7 +137,7 @@ def whip() -> Case:
 
 
 def falling_bicycle() -> Case:
-    """Create a bicycle that stands almost upright, until it leans by 1.3 rad."""
+    """Create a bicycle that starts almost upright; the run ends at 1.3 rad of lean."""
     bicycle = systems.WhippleBicycle.running(speed=0.5, lean_rate=1e-4)
     system, y0 = bicycle.system, bicycle.initial_state()
     end = nhjax.integrate(
@@ -183,7 +186,7 @@ class Row(NamedTuple):
 
 
 def timed(call: Callable[[], Any]) -> tuple[Any, float]:
-    """Call three times after a first time; return the result and the least time."""
+    """Call once to compile, and then three times; return the result and least time."""
     return jax.block_until_ready(call()), least_time(call, 3)
 
 
@@ -363,7 +366,8 @@ def of_ida(name: str, case: Case, exact: np.ndarray) -> Iterator[Row]:
         end = out.y[-1, : 2 * n] if out.success else np.full(2 * n, np.nan)
         error = float(np.max(np.abs(end - exact)) / np.max(np.abs(exact)))
         print(name, "IDA", rtol, error, out.nfev, seconds, flush=True)
-        # IDA does not report steps here; these are evaluations of the residual.
+        # This column has evaluations of the residual, because IDA does not report its
+        # steps here.
         yield Row(name, IDA_NAME, rtol, error, int(out.nfev), 0, seconds)
 
 
@@ -428,8 +432,9 @@ ECCENTRICITY = 0.8
 def ball_in_central_field() -> tuple[nhjax.LagrangianSystem, nhjax.State]:
     """Create a homogeneous ball that rolls on a plane around an attracting point.
 
-    Its centre moves as a particle of 7/5 of its mass in the same field (Routh), so that
-    the motion is integrable: an ellipse. It starts where it is farthest from the point.
+    The centre of the ball moves like a particle of 7/5 of its mass in the same field
+    (Routh), so that its path is an ellipse. The ball starts where it is farthest from
+    the attracting point.
     """
     manifold = nhjax.ProductGroup(nhjax.Euclidean(2), nhjax.SO3())
 
@@ -598,7 +603,7 @@ def measure_tolerances() -> tuple[str, dict[str, Any]]:
             row = stage_row(name, case, exact, stages, digits)
             line.append(row.error / row.setting)
             print(row, flush=True)
-        marker = "o-" if k < 10 else "s-"  # There are ten colours.
+        marker = "o-" if k < 10 else "s-"  # The colours repeat after ten lines.
         ax.loglog(SHOWN, np.array(line) * SHOWN, marker, label=name)
         ratios += line
         table.append([name, *(f"{x:.2g}" for x in line)])

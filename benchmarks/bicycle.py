@@ -1,6 +1,6 @@
 """The bicycle of the IFToMM benchmark problems: the largest accepted steps, and times.
 
-The bicycle of Meijaard et al. (2007) runs without a rider for 20 s, in three
+The bicycle of Meijaard et al. (2007) runs uncontrolled for 20 s, in three
 manoeuvres: M1 at 4 m/s with a roll rate of 0.05 rad/s, M2 at 4.6 m/s with 0.5 rad/s,
 and M3 at 8 m/s with 0.05 rad/s. A solution is accepted if its energy varies by less
 than a thousandth of a percent of the energy at the start, 100 (max E - min E) / E_0
@@ -33,12 +33,12 @@ from ._report import markdown_table, number, write
 DURATION = 20.0
 LARGEST_DRIFT = 1e-3
 STAGES = (2, 3, 4)
-# With small steps the default Jacobian is enough.
+# For steps as small as those of the reference, the default Jacobian is enough.
 REFERENCE_STAGES, REFERENCE_STEPS = 5, 4000
 REPEATS = 20
 # Larger numbers of steps are not tried.
 MOST_STEPS = 2**14
-# Exudyn's time for M2, on an i9-7940X, as its authors publish it.
+# The time of the program Exudyn for M2 on an i9-7940X, published by its authors.
 EXUDYN_SECONDS = 0.596
 
 
@@ -118,7 +118,7 @@ class Integrator:
         return jax.block_until_ready(sol)
 
     def run(self, y0: nhjax.State, num_steps: int) -> Run:
-        """Integrate, and look at the energies."""
+        """Integrate, and compute the energy after each step."""
         sol = self.solution(y0, num_steps)
         return Run(
             np.asarray(jnp.concatenate([sol.ys.q, sol.ys.v], axis=1)),

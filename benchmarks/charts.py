@@ -1,12 +1,12 @@
 """The two charts of a step on a group: reversal, energy over long runs, and cost.
 
-For each system, retraction and number of stages, and for the chart at the start of a
-step (the paper's) and that in its middle:
+The origin of the chart is at the start of the step, as in the paper, or in its middle.
+For each system, retraction, number of stages and chart, this benchmark measures:
 
-- how far 50 steps of h and as many of -h lead away from the start;
-- the largest relative error of the energy over a long run, without the first tenth and
-  within it, which tells a drift from an oscillation;
-- the iterations a step, and the time of a step relative to the chart at the start.
+- the distance from the initial state after 50 steps of h and 50 steps of -h;
+- the largest relative error of the energy in the first tenth of a long run and in the
+  whole run, which distinguishes a drift from an oscillation;
+- the iterations per step, and the time of a step relative to the chart at the start.
 """
 
 import argparse
@@ -31,7 +31,10 @@ RETRACTIONS = {"cay": nhjax.Cayley(), "exp": nhjax.Exponential()}
 
 
 def _uneven_ball(retraction: AbstractRetraction) -> systems.TurntableBall:
-    """A ball with three moments of inertia on a table at rest, which keeps energy."""
+    """Create a ball with three different moments of inertia on a table at rest.
+
+    The table does not turn, so that the energy is conserved.
+    """
     return systems.TurntableBall.rolling(
         (0.5, -0.2),
         (0.4, 0.3),
@@ -53,7 +56,7 @@ SYSTEMS = {
 
 
 class Row(NamedTuple):
-    """What was measured for one chart of one system."""
+    """The measured quantities for one chart of one system."""
 
     system: str
     retraction: str
@@ -104,7 +107,8 @@ def measure(
     jax.block_until_ready(run(y0, dt))
     spent = time.process_time() - start
     values = np.asarray(sol.ys)
-    # The energy of a motion may be near zero: the kinetic energy gives its scale too.
+    # The energy of a motion may be near zero. The scale of its errors is therefore the
+    # larger of the energy and the kinetic energy.
     scale = max(abs(values[0]), float(0.5 * y0.p @ y0.v))
     errors = np.abs(values - values[0]) / scale
     return Row(

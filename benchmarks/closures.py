@@ -1,8 +1,8 @@
-"""Which closure of the multiplier to choose: every gallery system, s = 2..5.
+"""A comparison of the closures of the multiplier on systems of the gallery, s = 2..5.
 
-For each closure: the order of (q, v), the symmetry defect (50 steps there and back),
-the largest energy error in the first and the last fifth of a long run, and the largest
-|Λ^s - λ_c| of that run.
+For each closure, the table has the order of (q, v), the symmetry defect after 50 steps
+of h and 50 steps of -h, the largest energy error in the first and the last fifth of a
+long run, and the largest |Λ^s - λ_c| of the long run.
 """
 
 import argparse
@@ -25,7 +25,7 @@ CLOSURES = ("propagated", "consistent", "symmetric")
 
 
 class Case(NamedTuple):
-    """A system, the time of its order test, and step and length of its long run."""
+    """A system, the time of its order test, and the step and time of its long run."""
 
     name: str
     example: AbstractConstrainedExample
@@ -35,7 +35,7 @@ class Case(NamedTuple):
 
 
 def cases() -> list[Case]:
-    """The constrained systems of the gallery."""
+    """Return constrained systems of the gallery."""
     cvt = systems.ContinuouslyVariableTransmission
     return [
         Case("particle", systems.NonholonomicParticle(), 3.0, 0.1, 2000.0),
@@ -45,7 +45,7 @@ def cases() -> list[Case]:
         Case("sleigh", systems.ChaplyginSleigh(), 1.6, 0.1, 200.0),
         Case("knife edge", systems.KnifeEdge(), 3.0, 0.1, 1000.0),
         Case("rolling disc", systems.VerticalRollingDisc(), 3.0, 0.1, 1000.0),
-        # λ ~ 1/ż is singular where ż passes zero: the run ends before.
+        # λ ~ 1/ż is singular where ż passes zero. The run ends before this time.
         Case("Appell", systems.Appell(), 1.0, 0.01, 1.0),
     ]
 
@@ -63,7 +63,7 @@ class Measured(NamedTuple):
 
 
 def measure(case: Case, stages: int, closure: str, length: float) -> Measured:
-    """All figures of one system, number of stages and closure."""
+    """Measure one system with one number of stages and one closure."""
     method = nhjax.LobattoIIIAB(stages, closure)
     system, y0 = case.example.system, case.example.initial_state()
     order, end_error = observed_order(case, system, method, y0)
@@ -80,11 +80,13 @@ def observed_order(case, system, method, y0) -> tuple[float, float]:
         q, v, *_ = case.example.exact(t)  # pyright: ignore[reportAttributeAccessIssue]
     except AttributeError:
         q, v = reference(system, y0, t)
-    # Large enough for errors above round-off; the exact Jacobian converges there.
+    # These step sizes are so large that errors are above round-off. `Newton` is used,
+    # because it converges for such step sizes.
     counts = {2: (32, 64, 128), 3: (16, 32, 64), 4: (8, 16, 32), 5: (6, 12, 24)}
     counts = counts[method.stages]
 
-    # One program for all step sizes: the coarser runs go on beyond the time.
+    # One program runs all step sizes with the same number of steps, so that runs with
+    # larger steps continue beyond t.
     @jax.vmap
     def run(dt):
         return nhjax.integrate(
@@ -104,7 +106,8 @@ def observed_order(case, system, method, y0) -> tuple[float, float]:
         dq, dv = ys.q[lane, count - 1] - q, ys.v[lane, count - 1] - v
         errors.append(float(max(jnp.max(jnp.abs(dq)), jnp.max(jnp.abs(dv)))))
     if errors[-1] < 1e-13:
-        # At round-off there is no slope to see; take the coarser pair, if it has one.
+        # Errors at round-off show no order. Use the two larger step sizes instead, if
+        # their errors are above round-off.
         errors = errors[:-1]
     if errors[-1] < 1e-13:
         return np.nan, float(errors[-1])
@@ -139,7 +142,7 @@ def long_run(system, method, y0, dt, time) -> tuple[float, float, float, int]:
 
 
 def _ensemble(stages: int, closure: str, members: int) -> tuple[float, float]:
-    """Mean squared energy error of the chaotic ensemble around T = 10 and T = 200."""
+    """Return mean squared energy errors of the chaotic ensemble near T = 10 and 200."""
     chaotic = systems.ChaoticSystem()
     system, method = chaotic.system, nhjax.LobattoIIIAB(stages, closure)
     q, v = chaotic.ensemble(members)
@@ -158,11 +161,15 @@ def _ensemble(stages: int, closure: str, members: int) -> tuple[float, float]:
 
 
 def verdict(rows: list[tuple[str, int, str, Measured]]) -> tuple[str, str]:
-    """The closure whose worst last-fifth energy error is nearest to the best one's."""
+    """Choose the closure with the smallest worst ratio of energy errors.
+
+    The ratio is the energy error of a closure in the last fifth of a run, divided by
+    the smallest such error of all closures.
+    """
     worst: dict[str, float] = dict.fromkeys(CLOSURES, 1.0)
     for name, stages in {(row[0], row[1]) for row in rows}:
         last = {r[2]: r[3].energy_last for r in rows if r[:2] == (name, stages)}
-        # Below 1e-13 all closures are at round-off, and their ratios mean nothing.
+        # Errors below 1e-13 are round-off, and their ratios would be meaningless.
         last = {k: np.inf if np.isnan(x) else max(x, 1e-13) for k, x in last.items()}
         best = min(last.values())
         for closure, x in last.items():
@@ -206,7 +213,8 @@ def main() -> None:
                     ]
                 )
                 print(*lines[-1], sep="\t", flush=True)
-            # Compiled programs hold memory maps, of which a process has only so many.
+            # Each compiled program uses memory maps, and a process can have only a
+            # limited number of them.
             jax.clear_caches()
     header = ["system", "s", "closure", "order", "error", "there and back"]
     header += ["energy, first fifth", "energy, last fifth", "|Λ^s - λ_c|", "steps"]

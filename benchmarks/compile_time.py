@@ -1,11 +1,12 @@
-"""What the first call costs: time of the processor to trace, lower and compile a run.
+"""The cost of a first call: processor time to trace, lower and compile a run.
 
-Beside it stands the time of a later call of the same program.
+The table also has the time of a later call of the same program.
 
-Programs in the lanes of vectors are compiled to native code while they are lowered. The
-bicycle has eight coordinates and five constraints, written as a user would write them.
-Each program is compiled by two processes, one after the other, that share an empty
-directory for JAX's compilation cache: the first stores what the second finds.
+Vectorised programs (the engine `lanes`) are compiled to native code while JAX lowers
+them. The bicycle has eight coordinates and five constraints, written as a user would
+write them. Each program is compiled by two processes, one after the other, which share
+a directory for JAX's compilation cache. The directory is empty at first: the first
+process stores its compiled programs there, and the second process loads them.
 
     python -m benchmarks.compile_time
 """
@@ -33,7 +34,7 @@ KINDS = ("run", "ensemble", "gradient")
 
 
 def cases() -> list[tuple[str, Any, nhjax.State, int, str]]:
-    """The name, system, state, number of stages and kind of each program."""
+    """Return the name, system, state, number of stages and kind of each program."""
     chaotic, top = systems.ChaoticSystem(), systems.HeavyTopSE3()
     riding = systems.WhippleBicycle.running(speed=5.0, lean_rate=0.5)
     upright = riding.initial_state()
@@ -58,7 +59,10 @@ def cases() -> list[tuple[str, Any, nhjax.State, int, str]]:
 
 
 def program(system: Any, stages: int, kind: str) -> Callable[[Any, Any], Any]:
-    """A function of a state and a step size, or of those of an ensemble."""
+    """Return the function to compile, which takes a state and a step size.
+
+    For an ensemble it takes a state and an array of step sizes.
+    """
 
     def run(y0, dt):
         return nhjax.integrate(
@@ -82,7 +86,7 @@ def program(system: Any, stages: int, kind: str) -> Callable[[Any, Any], Any]:
 
 
 def compiled(function: Callable[..., Any], *args: Any) -> tuple[Any, list[float]]:
-    """A compiled program, and the seconds to trace, to lower and to compile it."""
+    """Return a compiled program, and the seconds to trace, lower and compile it."""
     times = [time.process_time()]
     traced = jax.jit(function).trace(*args)
     times.append(time.process_time())
@@ -94,7 +98,7 @@ def compiled(function: Callable[..., Any], *args: Any) -> tuple[Any, list[float]
 
 
 def plain_calls() -> list[tuple[str, float]]:
-    """The seconds of the first calls of a user who has written a small machine."""
+    """Measure first calls, in seconds, as a user of a small machine would make them."""
     system, q, v, gains = wheeled_inverted_pendulum()
     method = nhjax.LobattoIIIAB(3)
     found = []

@@ -1,8 +1,9 @@
 """Compile time and cost per step of the chaotic system, one trajectory and a batch.
 
-Compile time is the first call of `integrate` (trace and compile) less a later one, the
-median of three; run times are medians of seven. The ratios are within one run; absolute
-times are not comparable between machines.
+Compile time is the time of the first call of `integrate`, which traces and compiles,
+minus the time of a later call; it is the median of three. Run times are medians of
+seven. The ratios compare times of the same run of this benchmark. Absolute times are
+not comparable between machines.
 """
 
 import argparse
@@ -22,7 +23,10 @@ COMPILATIONS, REPEATS = 3, 7
 
 
 def timed(function, *args) -> tuple[float, float]:
-    """Seconds of the first call less those of a later one, and of a later one."""
+    """Return the compile time and the run time of a function, in seconds.
+
+    The compile time is the time of a first call minus the time of a later call.
+    """
 
     def once() -> float:
         start = time.perf_counter()
@@ -40,7 +44,11 @@ def timed(function, *args) -> tuple[float, float]:
 def measure(
     stages: int, solver: nhjax.AbstractStageSolver, members: int, num_steps: int
 ) -> tuple[float, float, float, float]:
-    """Compile seconds and µs per step and trajectory: one trajectory, then a batch."""
+    """Measure one trajectory and a batch.
+
+    Returns the compile time in seconds and the time in µs per step of one trajectory,
+    then the compile time of the batch and its time in µs per step and trajectory.
+    """
     chaotic = systems.ChaoticSystem()
     system, method = chaotic.system, nhjax.LobattoIIIAB(stages)
     q, v = chaotic.ensemble(members)
@@ -78,7 +86,7 @@ def main() -> None:
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     solvers = (nhjax.SimplifiedNewton(), nhjax.Newton())
-    # The first compilation of a process pays for starting the compiler.
+    # The first compilation of a process also starts the compiler, and is not measured.
     measure(2, solvers[0], 1, 2)
     rows, data = [], []
     for solver in solvers:

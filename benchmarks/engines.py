@@ -1,11 +1,12 @@
-"""Ensembles in the lanes of vectors beside one kernel for each member, in one run.
+"""A comparison of the two engines for ensembles on a CPU (see `nhjax.engines`).
 
-For every system of the gallery and every kind of output or derivative, an ensemble is
-compiled by both engines (see `nhjax.engines`) and run in turn; every member has a step
-size of its own. Times are of the processor, the fastest of seven runs; compile times
-are those of the first call, from the trace on. Agreement is the largest difference of
-any number that comes out, relative to the largest of its array, and the number of
-members whose counts of iterations differ.
+One engine computes members in the lanes of vectors; the other runs a kernel for each
+member. For every system of the gallery, and every kind of output or derivative, both
+engines compile the same ensemble, and their runs alternate. Each member has its own
+step size. Times are processor times, the least of seven runs. Compile times are the
+times of tracing, lowering and compiling. The table also has the largest difference
+between the results of the engines, relative to the largest number of its array, and the
+number of members whose numbers of iterations differ.
 
     taskset -c 0 python -m benchmarks.engines --kinds end rows
 """
@@ -34,7 +35,8 @@ ADJOINTS = {
     "reversible": nhjax.ReversibleAdjoint(),
 }
 KINDS = ("end", "rows", "dense", "jvp", *ADJOINTS)
-# Motions of most examples have time scales of about one; these are faster.
+# Most examples have time scales of about one. The examples below move faster, and have
+# shorter runs.
 FINAL_TIMES = {
     "AndrewsSqueezer": 0.01,
     "BallInBowl": 1.0,
@@ -48,7 +50,7 @@ FINAL_TIMES = {
 
 
 def gallery() -> dict[str, Any]:
-    """All examples with their default parameters, by name."""
+    """Return all examples with their default parameters, by name."""
     classes = {
         name: value
         for name, value in vars(systems).items()
@@ -64,9 +66,10 @@ def gallery() -> dict[str, Any]:
 def program(
     example: Any, kind: str, stages: int, num_steps: int
 ) -> Callable[[Any, Any], Any]:
-    """A function of one member's state and step size: arrays, and sweeps of its run.
+    """Return a function of one member's initial state and step size.
 
-    A run that fails counts as minus one sweep.
+    The function returns arrays, and the number of iterations of the run, which is -1
+    if the run fails.
     """
     method = nhjax.LobattoIIIAB(stages)
 
@@ -117,7 +120,7 @@ def program(
 
 
 def compiled(engine: str, function: Callable[..., Any], *args: Any):
-    """The compiled function, seconds of the processor, and the engine that it took."""
+    """Compile a function; return it with the processor time and the engine it uses."""
     os.environ["NHJAX_ENGINE"] = engine
     jax.clear_caches()
     start = time.process_time()
@@ -129,7 +132,7 @@ def compiled(engine: str, function: Callable[..., Any], *args: Any):
 
 
 def fastest(functions: list[Callable[[], Any]]) -> list[float]:
-    """Seconds of the processor of each, the fastest of runs in turn."""
+    """Call the functions in turn; return the least processor time of each."""
     best = [np.inf] * len(functions)
     for _ in range(REPEATS):
         for k, function in enumerate(functions):
@@ -140,7 +143,7 @@ def fastest(functions: list[Callable[[], Any]]) -> list[float]:
 
 
 def difference(got: Any, expected: Any) -> float:
-    """The largest difference of two trees, relative to the largest of each array."""
+    """Return the largest difference, relative to the largest number of each array."""
     worst = 0.0
     for x, y in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
         x, y = np.asarray(x), np.asarray(y)
@@ -153,7 +156,7 @@ def difference(got: Any, expected: Any) -> float:
 def case(
     name: str, example: Any, kind: str, options: argparse.Namespace
 ) -> dict[str, Any]:
-    """Both engines on one system and one kind of output."""
+    """Measure both engines on one system and one kind of output."""
     members, steps = options.members, options.num_steps
     y0 = example.initial_state()
     y0 = jax.tree.map(lambda x: jnp.broadcast_to(x, (members, *x.shape)), y0)

@@ -1,17 +1,20 @@
-"""Ensembles in chunks beside a bare `vmap`, their memory, and runs that are killed.
+"""Ensembles in chunks: their time compared with `vmap`, memory, and interrupted runs.
 
-The chaotic system, s = 2, h = 0.1, with the mean and the variance of the energy at the
-end over members that are a function of their index. Beside the time of a member and
-step is that of one call of a compiled `vmap` of 1000 members, in turn in one process;
-times are of the processor, the least of all rounds. Peak memory is that of a process of
-its own for each number of members, and grows with the compiler's before it runs.
+The system is the chaotic system with s = 2 and h = 0.1. The members are a function of
+their index, and the ensemble computes the mean and the variance of the energy at the
+end. The time per member and step is compared with one call of a compiled `vmap` of 1000
+members, which is measured before and after the ensemble in the same process. Times are
+processor times; the time of `vmap` is the least of all calls. Peak memory is measured
+in a separate process for each number of members, and includes the memory of the
+compiler.
 
-With `--kills K` a run of 200 chunks that streams to disk is killed (kill -9) K times at
-random moments, and gone on with; its bytes are compared with those of a run that
-nothing has disturbed. With `--processes P` the same is done with two processes of JAX,
-and P times the compiled ensemble is run by one process and then by two, with a core
-each. Beside the time of the wall is that of the processor, the most of both processes,
-which tells what else ran.
+With `--kills K`, a run of 200 chunks that writes to disk is killed (kill -9) K times at
+random moments, and resumed each time. Its files are compared, byte for byte, with the
+files of a run that was not interrupted. With `--processes P`, this test is repeated
+with two JAX processes. In addition, the compiled ensemble is then run P times by one
+process and by two processes, each with one core. The table has wall times and processor
+times, the larger of both processes. A wall time above the processor time shows that
+other programs were running.
 
     python -m benchmarks.ensembles --members 10000 100000 1000000 --num-steps 1000
 """
@@ -47,7 +50,7 @@ REDUCTIONS = {"mean": nhjax.Mean(), "variance": nhjax.Variance()}
 
 
 def problem(num_steps: int) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-    """The run of a member, and the member of an index."""
+    """Return two functions: the run of a member, and the member of an index."""
     chaotic, method = systems.ChaoticSystem(), nhjax.LobattoIIIAB(2)
 
     def member(index):
@@ -70,7 +73,7 @@ def problem(num_steps: int) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]
 
 
 def measure(members: int, num_steps: int, rounds: int = ROUNDS) -> dict[str, Any]:
-    """Time of a member and step both ways, and peak memory of this process."""
+    """Measure the time per member and step of both, and this process's peak memory."""
     run, member = problem(num_steps)
 
     def chunks(count):
@@ -87,7 +90,8 @@ def measure(members: int, num_steps: int, rounds: int = ROUNDS) -> dict[str, Any
     outcome = chunks(members)
     many = (time.process_time() - before) / members
     seconds = time.perf_counter() - start
-    # Before and after, so that what else runs hits both.
+    # `vmap` is measured before and after the ensemble, so that other load on the
+    # machine affects both.
     after = least_time(partial(bare, indices), rounds, time.process_time) / BATCH
     one = min(one, after)
     return {
@@ -104,13 +108,13 @@ def measure(members: int, num_steps: int, rounds: int = ROUNDS) -> dict[str, Any
 
 
 def stream(folder: str) -> None:
-    """A run of many chunks to disk."""
+    """Run an ensemble of many chunks that are written to disk."""
     run, member = problem(50)
     nhjax.ensemble(run, member, num_members=CHUNKS * 64, chunk_size=64, out=folder)
 
 
 def digest(folder: Path) -> str:
-    """A checksum of all files of a store, and of their names."""
+    """Compute a checksum of all files of a store and of their names."""
     made = hashlib.sha256()
     for path in sorted(folder.rglob("*")):
         if path.is_file():
@@ -119,9 +123,9 @@ def digest(folder: Path) -> str:
 
 
 def start(count: int, *arguments: str, first_core: int = 0) -> list[subprocess.Popen]:
-    """Start this program as a number of processes that know of one another.
+    """Start this program in `count` processes that form one JAX job.
 
-    Where there are several, or they are timed, each has one core and one thread.
+    Each process has one core and one thread.
     """
     with socket.socket() as found:
         found.bind(("localhost", 0))
@@ -145,7 +149,7 @@ def start(count: int, *arguments: str, first_core: int = 0) -> list[subprocess.P
 
 
 def join(index: int, count: int, port: int, core: int) -> None:
-    """Be one of the processes, on one core."""
+    """Make this process one of the processes of a job, on one core."""
     os.sched_setaffinity(0, {core})
     if count > 1:
         jax.distributed.initialize(f"localhost:{port}", count, index)
@@ -160,7 +164,10 @@ def ended(processes: list[subprocess.Popen]) -> list[str]:
 
 
 def timed(members: int) -> list[float]:
-    """Times of the wall and of the processor, of a program that is compiled."""
+    """Return the wall time and the processor time of the second run of an ensemble.
+
+    The first run compiles.
+    """
     run, member = problem(1000)
     found = []
     for _ in range(2):
@@ -173,7 +180,7 @@ def timed(members: int) -> list[float]:
 
 
 def speedup(rounds: int, members: int = 200_000) -> dict[str, Any]:
-    """Wall times of one and of two processes, in turn."""
+    """Measure one process and two processes in turn, `rounds` times."""
     found: dict[str, list[list[float]]] = {"one": [], "two": []}
     for i in range(rounds):
         for name, count in (("one", 1), ("two", 2)):
@@ -197,11 +204,11 @@ def kills(number: int, count: int = 1, seed: int = 0) -> dict[str, Any]:
         for _ in range(number):
             processes = start(count, "--stream", str(killed))
             before = done()
-            # On the way to the end, so that there is something left for all others.
+            # Kill before the last chunk, so that chunks are left for the next kills.
             goal = before + moments.uniform(0, 2 * (CHUNKS - before) / (number + 1))
             while processes[0].poll() is None and done() < goal:
                 time.sleep(0.0005)
-            # In any order, with some time between them.
+            # Kill the processes in random order, with some time between them.
             for process in moments.sample(processes, count):
                 time.sleep(moments.uniform(0, 0.02))
                 process.send_signal(signal.SIGKILL)
@@ -218,7 +225,7 @@ def kills(number: int, count: int = 1, seed: int = 0) -> dict[str, Any]:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """The times and the memory."""
+    """Write the table of times and memory."""
     header = ["members", "steps", "bare vmap [µs]", "ensemble [µs]", "ratio"]
     header += ["wall [s]", "failed", "peak memory [MB]"]
     lines = [
@@ -238,7 +245,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def told(found: dict[str, Any]) -> str:
-    """What came of runs that were killed."""
+    """Write in words whether killed runs gave the same files."""
     same = "the same" if found["is_same"] else "OTHER"
     who = "One process" if found["processes"] == 1 else "Two processes"
     return (
@@ -249,7 +256,7 @@ def told(found: dict[str, Any]) -> str:
 
 
 def compared(found: dict[str, Any]) -> str:
-    """The wall times of one process and of two."""
+    """Write the table of times of one process and of two processes."""
     lines = [
         [f"{x:.2f}" for x in (*one, *two, two[0] / one[0], two[1] / one[1])]
         for one, two in zip(found["one"], found["two"], strict=True)

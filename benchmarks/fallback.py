@@ -1,9 +1,10 @@
-"""The cost of `SimplifiedNewton(fallback=True)` where the fallback is never used.
+"""The cost of `SimplifiedNewton(fallback=True)` in runs that never use the fallback.
 
 Each system of the gallery is run with three stages, once with
-`SimplifiedNewton(fallback=False)` and once with `fallback=True`, in steps that the
-former solves, so that Newton's method is compiled and never used. The table has the
-time to trace, lower and compile each run, and the time of a step of both.
+`SimplifiedNewton(fallback=False)` and once with `fallback=True`. The steps are so small
+that the run without the fallback solves all of them. With `fallback=True`, Newton's
+method is therefore compiled, but never used. The table has the time to trace, lower and
+compile each of the two runs, and the time of a step.
 
     python -m benchmarks.fallback
 """
@@ -49,7 +50,7 @@ def measure(example: Any) -> dict[str, float]:
         start = time.process_time()
         compiled = jax.jit(run).lower(y0, dt).compile()
         found[f"compile {name}"] = time.process_time() - start
-        # Andrews' squeezer wants shorter steps than the others.
+        # Andrews' squeezer needs shorter steps than the other systems.
         while not fallback and int(compiled(y0, dt).stats["num_steps"]) < NUM_STEPS:
             dt = dt / 10
         sol = compiled(y0, dt)

@@ -1,14 +1,16 @@
-"""How far nhjax is from the hardware: the same algorithm, written by hand in C++.
+"""A comparison of nhjax with the same algorithm written by hand in C++.
 
-`floor.cpp` solves the chaotic system, s = 3, as `SimplifiedNewton` does: the same
-unknowns, starting values, factorised structure, order of corrections and stop rule,
-with derivatives by hand. What does not change over the iterations is computed once, and
-there is a version that takes 2, 4 or 8 trajectories at once, in the lanes of a vector,
-until the slowest of them has converged. It keeps no statistics but the iterations.
+`floor.cpp` solves the chaotic system, s = 3, like `SimplifiedNewton`: with the same
+unknowns, starting values, factorised structure, order of corrections and stopping rule.
+Its derivatives are written by hand. Quantities that do not change during the iterations
+are computed once. A second version iterates 2, 4 or 8 trajectories at once, in the
+lanes of a vector, until the slowest of them has converged. The only statistic that the
+program counts are the iterations.
 
-Times are of one core against one core, where the platform lets a process be pinned;
-nhjax on all cores is beside it. Medians of seven, C++ and nhjax in turn, and each the
-second of two runs on end. Both must end in the same states. `--smoke` takes a minute.
+Both programs run on one core, if the platform allows to pin a process to a core. The
+table also has nhjax on all cores. Times are medians of seven measurements, with C++ and
+nhjax in turn; each measurement is the second of two successive runs. Both programs must
+end in the same states. `--smoke` takes a minute.
 """
 
 import argparse
@@ -40,11 +42,11 @@ H, STAGES, REPEATS, AGREE_AT = 0.1, 3, 7, 20.0
 FLAGS = ["-O3", "-march=native", "-std=c++17"]
 SOURCE = Path(__file__).with_suffix(".cpp")
 LANES = (1, 2, 4, 8)
-STATE = 21  # numbers of q, v and p
+STATE = 21  # the number of entries of q, v and p together
 
 
 class Case(NamedTuple):
-    """Trajectories that run together."""
+    """A number of trajectories that run together, and their steps."""
 
     name: str
     members: int
@@ -61,7 +63,10 @@ class Run(NamedTuple):
 
 
 def compiled(folder: Path) -> tuple[list[str], Path] | None:
-    """The command that compiled the C++ program, and the program; None without one."""
+    """Compile the C++ program; return the command and the program.
+
+    Returns None if there is no C++ compiler.
+    """
     for name in ("c++", "g++", "clang++"):
         compiler = shutil.which(name)
         if compiler is None:
@@ -74,7 +79,7 @@ def compiled(folder: Path) -> tuple[list[str], Path] | None:
 
 
 def initial_data(members: int) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
-    """The system and the states that a case starts from."""
+    """Return the system and the initial states of a case."""
     chaotic = systems.ChaoticSystem()
     q, v = chaotic.ensemble(max(members - 1, 2))
     if members == 1:
@@ -85,7 +90,10 @@ def initial_data(members: int) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
 
 @contextlib.contextmanager
 def one_core(pinned: bool) -> Iterator[None]:
-    """Processes that start here run on one core, the last; where there is a way."""
+    """Run processes that start in this context on one core, the last one.
+
+    Without `pinned`, or if the platform cannot pin processes, there is no effect.
+    """
     if not (pinned and hasattr(os, "sched_setaffinity")):
         yield
         return
@@ -98,7 +106,7 @@ def one_core(pinned: bool) -> Iterator[None]:
 
 
 def serve() -> None:
-    """Run what each line of the input asks for, in a process that stays."""
+    """Run the case of each input line, in a process that keeps compiled programs."""
     programs: dict[tuple[int, int], tuple[Callable[..., Any], nhjax.State]] = {}
     for line in sys.stdin:
         members, num_steps, path = json.loads(line)
@@ -116,7 +124,10 @@ def serve() -> None:
 
 
 def batch(members: int, num_steps: int) -> tuple[Callable[..., Any], nhjax.State]:
-    """The compiled run of a case, without a batch axis for one trajectory."""
+    """Return the compiled run of a case and its initial states.
+
+    For one trajectory there is no batch axis.
+    """
     system, start = initial_data(members)
 
     def run(y0: nhjax.State) -> tuple[Array, Array]:
@@ -140,7 +151,7 @@ class Worker:
     """A process that runs nhjax, on one core or on all."""
 
     def __init__(self, folder: Path, pinned: bool):
-        """Start it; what it compiled stays until it is closed."""
+        """Start the process, which keeps its compiled programs until it is closed."""
         self.path = folder / f"end-{int(pinned)}.npy"
         with one_core(pinned):
             self.process = subprocess.Popen(
@@ -151,7 +162,7 @@ class Worker:
             )
 
     def run(self, members: int, num_steps: int) -> Run:
-        """The second of two runs of a case."""
+        """Run a case twice, and return the second run."""
         stdin, stdout = self.process.stdin, self.process.stdout
         assert stdin is not None
         assert stdout is not None
@@ -163,7 +174,7 @@ class Worker:
         return Run(float(reply), rows[:, STATE], rows[:, :STATE])
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         self.process.communicate()
 
 
@@ -171,11 +182,15 @@ class Program:
     """The compiled C++ program."""
 
     def __init__(self, path: Path, folder: Path):
-        """`path`, which reads and writes in `folder`."""
+        """Store the path of the program, and the folder of its input and output."""
         self.path, self.folder = path, folder
 
     def run(self, members: int, num_steps: int, lanes: int) -> tuple[Run, float]:
-        """The second of two runs, and the mean of the most iterations in a step."""
+        """Run a case twice; return the second run, and the mean of a maximum.
+
+        The maximum is the largest number of iterations of all trajectories in a step;
+        its mean is over the steps.
+        """
         start, end = self.folder / f"start-{members}.bin", self.folder / "end.bin"
         if not start.exists():
             _, y0 = initial_data(members)
@@ -198,7 +213,7 @@ class Program:
 def measure(
     cases: list[Case], workers: dict[str, Worker], program: Program | None
 ) -> list[dict[str, Any]]:
-    """Every figure of every case."""
+    """Measure all cases with all programs."""
     times: list[dict[str, list[float]]] = [{} for _ in cases]
     iterations: list[dict[str, float]] = [{} for _ in cases]
     most = [0.0 for _ in cases]
@@ -233,7 +248,7 @@ def measure(
 
 
 def difference(case: Case, workers: dict[str, Worker], program: Program) -> float:
-    """The largest difference between states of C++ and nhjax at one time."""
+    """Return the largest difference between states of C++ and nhjax at one time."""
     num_steps = round(AGREE_AT / H)
     ends = next(iter(workers.values())).run(case.members, num_steps).ends
     others = [program.run(case.members, num_steps, lanes)[0] for lanes in case.lanes]
@@ -241,7 +256,7 @@ def difference(case: Case, workers: dict[str, Worker], program: Program) -> floa
 
 
 def report(rows: list[dict[str, Any]]) -> str:
-    """The tables."""
+    """Write the tables."""
     lines, against = [], []
     for row in rows:
         micros, iterations = row["micros"], row["iterations"]
@@ -291,7 +306,7 @@ def main() -> None:
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    # One core of a processor is what is compared, whatever else there is.
+    # Programs are compared on one core of a CPU, even if the machine has a GPU.
     jax.config.update("jax_platforms", "cpu")
     if options.serve:
         serve()

@@ -1,12 +1,13 @@
-"""What a gradient costs: time, memory and compile time of every adjoint.
+"""The cost of a gradient: time, memory and compile time of every adjoint.
 
-A scalar of the final state is differentiated with respect to the initial state, dt and
-the system's parameters. Times are over those of the run alone, in one process and
-interleaved: medians of seven, of three beyond 10⁴ steps; processor time, that of
-all threads, depends less on what else runs. Each system and number of
-steps has a process of its own. `temp` is what the compiled program allocates,
-`resident` by how much the peak of resident memory lies above that before the run
-(Linux alone). `--smoke` takes a minute, everything some ten.
+A scalar function of the final state is differentiated with respect to the initial
+state, dt and the parameters of the system. Times are given as ratios to the time of the
+run without gradient; both are measured in turn in one process. They are medians of
+seven, or of three for more than 10⁴ steps. Processor times, which add up all threads,
+depend less on other load of the machine. Each system and number of steps has its own
+process. `temp` is the memory that the compiled program allocates. `resident` is the
+peak of resident memory minus the resident memory before the run (on Linux only).
+`--smoke` takes one minute, a full run about ten.
 """
 
 import argparse
@@ -35,7 +36,8 @@ from ._report import from_fresh_process, markdown_table, number, RESULTS, write
 
 SAVED_SYSTEM, SAVED_LENGTHS = "sleigh", [10**2, 10**3, 10**4]
 DT, REPEATS, LONG, REPEATS_OF_LONG = 0.1, 7, 10**4, 3
-# So that freed memory goes back at once, and is not taken for what a run needs.
+# With these settings freed memory is returned to the system at once. Otherwise it would
+# count as memory of the next run.
 MALLOC = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536"}
 
 
@@ -44,7 +46,7 @@ EXAMPLES = {
     "sleigh": of_the_gallery(systems.ChaplyginSleigh),
     "CVT": of_the_gallery(systems.ContinuouslyVariableTransmission),
     "Suslov": of_the_gallery(systems.Suslov),
-    # Once, since functions that are created again make another system.
+    # Create this system only once: new functions would make a different system.
     "Suslov in a potential": functools.cache(suslov_in_a_potential),
     "heavy top": of_the_gallery(systems.HeavyTop),
 }
@@ -62,10 +64,10 @@ def problem(
     adjoint: str = "direct",
     every: int | None = None,
 ) -> tuple[Callable[..., Array], tuple]:
-    """A loss, and the state, step and parameters that it is a function of.
+    """Return a loss function, and its arguments: the state, the step and parameters.
 
-    It is the sum of the squares of the final state, or with `every` of the states after
-    each so many steps.
+    The loss is the sum of the squares of q and v at the end. With `every`, it is the
+    sum over the states after each `every` steps.
     """
     saveat = nhjax.SaveAt(t1=every is None, steps=every or 0)
     system, y0 = EXAMPLES[name]()
@@ -89,12 +91,12 @@ def problem(
 
 
 def gradient(loss: Callable[..., Array]) -> Callable:
-    """Value and gradient with respect to everything."""
+    """Return the value of a loss and its gradient with respect to all arguments."""
     return jax.value_and_grad(loss, argnums=(0, 1, 2))
 
 
 def compiled(function: Callable, args: tuple) -> tuple[Any, float]:
-    """The compiled function and the seconds that it took to trace and compile."""
+    """Return the compiled function, and the seconds to trace and compile it."""
     jax.clear_caches()
     start = time.perf_counter()
     program = jax.jit(function).lower(*args).compile()
@@ -102,7 +104,7 @@ def compiled(function: Callable, args: tuple) -> tuple[Any, float]:
 
 
 def seconds(function: Callable, args: tuple) -> tuple[float, float]:
-    """Seconds of one run by the clock, and of all processors together."""
+    """Measure the wall time of one run, and its processor time of all cores."""
     start, processors = time.perf_counter(), time.process_time()
     jax.block_until_ready(function(*args))
     return time.perf_counter() - start, time.process_time() - processors
@@ -111,7 +113,7 @@ def seconds(function: Callable, args: tuple) -> tuple[float, float]:
 def both_medians(
     runs: dict[str, tuple[Callable, tuple]], repeats: int
 ) -> dict[str, tuple[float, ...]]:
-    """Both kinds of seconds of each, interleaved."""
+    """Return the median wall time and processor time of each run, measured in turn."""
     times = {name: [] for name in runs}
     for _ in range(repeats):
         for name, run in runs.items():
@@ -123,12 +125,12 @@ def both_medians(
 
 
 def medians(runs: dict[str, tuple[Callable, tuple]], repeats: int) -> dict[str, float]:
-    """Seconds of each by the clock, interleaved."""
+    """Return the median wall time of each run, measured in turn."""
     return {name: both[0] for name, both in both_medians(runs, repeats).items()}
 
 
 def resident(function: Callable, args: tuple) -> int | None:
-    """Bytes by which resident memory rises while the function runs, if known."""
+    """Return by how many bytes resident memory grows in a call, or None if unknown."""
     status = Path("/proc/self/status")
     if not status.exists():
         return None
@@ -138,19 +140,19 @@ def resident(function: Callable, args: tuple) -> int | None:
         lines = status.read_text().splitlines()
         return int(next(x for x in lines if x.startswith(name)).split()[1])
 
-    Path("/proc/self/clear_refs").write_text("5")  # The peak starts anew.
+    Path("/proc/self/clear_refs").write_text("5")  # This resets the peak.
     before = kilobytes("VmRSS")
     jax.block_until_ready(function(*args))
     return 1024 * max(kilobytes("VmHWM") - before, 0)
 
 
 def case(name: str, stages: int, num_steps: int, adjoints: list[str]) -> dict[str, Any]:
-    """Every figure of one system and number of steps."""
+    """Measure all adjoints for one system and number of steps."""
     loss, args = problem(name, stages, num_steps)
     functions = {"forward": loss}
     for adjoint in adjoints:
         functions[adjoint] = gradient(problem(name, stages, num_steps, adjoint)[0])
-    # The first compilation of a process pays for starting the compiler.
+    # The first compilation of a process also starts the compiler, and is not measured.
     compiled(jnp.sin, (args[1],))
     rows, runs, gradients = {}, {}, {}
     for key, function in functions.items():
@@ -161,7 +163,8 @@ def case(name: str, stages: int, num_steps: int, adjoints: list[str]) -> dict[st
             "temp": program.memory_analysis().temp_size_in_bytes,
         }
     for key, (program, _) in runs.items():
-        # A first run, during which memory of the compiler may still be given back.
+        # Memory is measured in the second run, because during the first run the
+        # compiler may still free memory.
         outcome = jax.block_until_ready(program(*args))
         rows[key]["resident"] = resident(program, args)
         if key != "forward":
@@ -175,7 +178,7 @@ def case(name: str, stages: int, num_steps: int, adjoints: list[str]) -> dict[st
 
 
 def difference(tree, reference) -> float:
-    """The largest difference over the largest entry."""
+    """Return the largest difference, relative to the largest entry of `reference`."""
     a, b = (
         np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)])
         for tree in (tree, reference)
@@ -184,13 +187,13 @@ def difference(tree, reference) -> float:
 
 
 def apart(kind: str, *args: Any) -> Any:
-    """The outcome of `kind`, one of PARTS, in a process of its own."""
+    """Run `kind`, one of PARTS, in its own process, and return the result."""
     part = json.dumps([kind, *args])
     return from_fresh_process("gradients", "--part", part, environment=MALLOC)
 
 
 def compilation(name: str, stages: list[int]) -> list[tuple[int, float, float]]:
-    """Seconds to compile the run and the gradient for each s."""
+    """Measure the seconds to compile the run and the gradient for each s."""
     compiled(gradient(problem(name, 2, 2)[0]), problem(name, 2, 2)[1])
     rows = []
     for s in stages:
@@ -200,10 +203,10 @@ def compilation(name: str, stages: list[int]) -> list[tuple[int, float, float]]:
 
 
 def modes(name: str, stages: int, num_steps: int) -> dict[str, float]:
-    """Times of forward mode and of reverse mode over that of the run.
+    """Measure forward mode and reverse mode, as ratios to the time of the run.
 
-    The derivative is that of (q, v) at the end with respect to v0, and for reverse mode
-    that of the loss.
+    (q, v) at the end is differentiated with respect to v0, or in products with respect
+    to v0 and dt. The row "reverse gradient" differentiates the loss instead.
     """
     system, y0 = EXAMPLES[name]()
 
@@ -254,7 +257,7 @@ def modes(name: str, stages: int, num_steps: int) -> dict[str, float]:
 
 
 def batch(stages: int, num_steps: int, members: int) -> dict[str, float]:
-    """Times of a batch over one, of the run and of the gradient."""
+    """Measure the run and the gradient of one trajectory and of a batch."""
     loss, (_, dt, parameters) = problem("chaotic", stages, num_steps)
     q, v = systems.ChaoticSystem().ensemble(members - 1)
     system = systems.ChaoticSystem().system
@@ -273,9 +276,10 @@ def batch(stages: int, num_steps: int, members: int) -> dict[str, float]:
 
 
 def saved(name: str, stages: int, lengths: list[int]) -> list[dict[str, Any]]:
-    """Microseconds a step of gradients that depend on the states of each step.
+    """Measure the microseconds per step of gradients of losses of all saved states.
 
-    Beside them stand those of gradients that depend on the last state.
+    The loss depends on the state after each step, or after each tenth step. The rows
+    also have the time for a loss of the last state.
     """
     rows = []
     for num_steps in lengths:
@@ -300,7 +304,7 @@ PARTS = {
 
 
 def case_table(cases: list[dict[str, Any]]) -> str:
-    """Time over the run's and memory, for each system and number of steps."""
+    """Write the table of relative times and memory of all systems and step numbers."""
     rows = []
     for entry in cases:
         forward = entry["rows"]["forward"]
@@ -329,12 +333,12 @@ def case_table(cases: list[dict[str, Any]]) -> str:
 
 
 def megabytes(size: int | None) -> str:
-    """In MB, as far as it is known."""
+    """Format a size in MB, if it is known."""
     return "" if size is None else f"{size / 1e6:.2f}"
 
 
 def draw(cases: list[dict[str, Any]], path: Path) -> None:
-    """Time and memory against the number of steps."""
+    """Plot time and memory against the number of steps."""
     figure = Figure(figsize=(9, 3.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     names = list(dict.fromkeys(entry["system"] for entry in cases))
@@ -414,7 +418,7 @@ def measure_but_saved(
     compile_stages: list[int],
     steps: int,
 ) -> dict[str, Any]:
-    """Measure everything but the gradients of saved states."""
+    """Measure all parts except the gradients of saved states."""
     s, cases = options.stages, []
     for name, num_steps in pairs:
         cases.append(apart("case", name, s, num_steps, options.adjoints))

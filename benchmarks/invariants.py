@@ -1,14 +1,17 @@
-"""What it does to keep the energy: its error, the cost, and what else changes.
+"""The effect of conserving the energy by `invariants`: its error, cost, side effects.
 
-For each system and number of stages, plainly and with the energy kept:
+Each system is run with each number of stages, without invariants ("plain") and with the
+energy as an invariant ("kept"). The tables have:
 
-- the largest relative error of the energy, at every so many steps of a run;
-- the sweeps and the time of a step with the energy kept, relative to the plain ones;
+- the largest relative error of the energy at saved steps of a run;
+- the iterations and the time of a step with the invariant, relative to plain steps;
 - the largest violation of a constraint;
-- what the system conserves besides, and for the chaotic ensemble the distribution of
-  positions: the mean of ‖q‖² over time and members, by how much it differs, with the
-  standard error over members of either, and the Kolmogorov-Smirnov distance between the
-  ‖q‖² of the two ways, beside that between two halves of the plain members.
+- the change of other quantities that the system conserves;
+- for the chaotic ensemble, the distribution of positions. It is described by the mean
+  of ‖q‖² over time and members, and the difference of these means between kept and
+  plain runs, both with standard errors over members. The table also has the
+  Kolmogorov-Smirnov distance between ‖q‖² of kept and plain runs, and for comparison
+  the distance between two halves of the plain members.
 """
 
 import argparse
@@ -27,12 +30,13 @@ from ._report import markdown_table, number, write
 
 
 STEP, SAVED = 0.1, 2000
-# Samples of chaotic motion before this time remember where the members started.
+# Samples of chaotic motion are used after this time, because earlier samples still
+# depend on the initial states.
 FORGOTTEN = 1000.0
 
 
 class Case(NamedTuple):
-    """A system, its states to start from, and what it conserves besides its energy."""
+    """A system, its initial states, and its conserved quantities besides the energy."""
 
     name: str
     system: Any
@@ -76,7 +80,7 @@ def _cases(members: int) -> list[Case]:
 
 
 class Run(NamedTuple):
-    """What was measured for one system, with the energy kept or not."""
+    """The measured quantities of one system, with or without an invariant."""
 
     energy: float
     spread: float
@@ -90,7 +94,7 @@ class Run(NamedTuple):
 def measure(
     case: Case, stages: int, duration: float, kept: Any, fallback: bool = False
 ) -> Run:
-    """Run one system in one way."""
+    """Run one system with the invariants `kept`."""
     num_steps = round(duration / STEP)
     every = max(1, num_steps // SAVED)
     system = case.system
@@ -136,7 +140,7 @@ def measure(
 
 
 def _mean(samples: np.ndarray) -> tuple[float, float]:
-    """Compute the mean over time and members, and its standard error over these."""
+    """Compute the mean over time and members, and its standard error over members."""
     means = np.mean(samples, axis=1)
     return float(np.mean(means)), float(np.std(means) / np.sqrt(len(means)))
 
@@ -149,7 +153,7 @@ def _distance(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def row(case: Case, stages: int, duration: float) -> dict[str, Any]:
-    """Compare the two ways."""
+    """Compare runs with and without conserved energy."""
     plain, kept = (measure(case, stages, duration, x) for x in (None, "energy"))
     found: dict[str, Any] = {
         "system": case.name,
@@ -176,10 +180,10 @@ def row(case: Case, stages: int, duration: float) -> dict[str, Any]:
 
 
 def both_energies_of_the_cvt(stages: int, duration: float) -> dict[str, Any]:
-    """Keep the energies of driver and passenger one by one.
+    """Conserve the energies of driver and passenger separately.
 
-    Where the passenger is nearly at rest and the driver is not, simplified Newton
-    hardly contracts.
+    The fallback is needed: when the passenger is nearly at rest and the driver is not,
+    `SimplifiedNewton` converges very slowly.
     """
     case = next(case for case in _cases(2) if case.name == "CVT")
 

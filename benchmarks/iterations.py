@@ -1,13 +1,13 @@
-"""Iterations and time a step of machines, with the default and the full Jacobian.
+"""Iterations and time per step of machines, with the default and the full Jacobian.
 
-For each machine `SimplifiedNewton` without the fallback runs some steps, once with the
-default part of the Jacobian and once with `jacobian="full"`. The table has the
-iterations and the time of a step, the time of the processor of the first call, and the
-largest step at which the run is solved, up to a factor 1.2. `benchmarks.machines` has
-another quantity, the first calls of all machines with default options.
+For each machine `SimplifiedNewton` without the fallback runs 20 steps, once with the
+default Jacobian, which omits some terms, and once with `jacobian="full"`. The table has
+the iterations and the time of a step, the processor time of the first call, and the
+largest step size with which all steps are solved, found up to a factor 1.2.
+`benchmarks.machines` measures the first calls of all machines with default options.
 
-A second table compares a step by `Newton` with a step with the full Jacobian, on some
-of the machines.
+A second table compares `Newton` with `SimplifiedNewton(jacobian="full")` on some of the
+machines.
 
     python -m benchmarks.iterations
     python -m benchmarks.iterations --only newton
@@ -38,7 +38,7 @@ BY_NEWTON = (
     ("RollingTorus", 3),
     ("bicycle, 4.6 m/s", 4),
 )
-# Steps are searched up to this factor of the given one.
+# The largest step is searched up to this factor times the step of the case.
 LARGEST_FACTOR = 32
 STEP_RATIO = 1.2
 RADIUS, LENGTH, TRACK = 0.1, 0.35, 0.5
@@ -117,7 +117,7 @@ def cases() -> Iterator[Case]:
 
 
 def timed(case: Case, solver: Any) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """Run a case with a solver; return the program, and what it took."""
+    """Run a case with a solver; return the program, its iterations and its times."""
 
     @jax.jit
     def run(y0, dt):
@@ -157,7 +157,8 @@ def measured(case: Case, jacobian: Any) -> dict[str, Any]:
     def is_solved(dt):
         return run(case.y0, jnp.asarray(dt)).result == nhjax.RESULTS.successful
 
-    # The search goes up from a step that is solved, to the first that is not.
+    # The search reduces the step until it is solved. Then it increases the step until
+    # the next larger step is not solved.
     largest, most = case.dt, LARGEST_FACTOR * case.dt
     while not is_solved(largest) and largest > case.dt / LARGEST_FACTOR:
         largest /= STEP_RATIO
@@ -201,7 +202,7 @@ def newton_table(names: list[str] | None) -> list[dict[str, Any]]:
 
 
 def pair(row: dict[str, Any], names: tuple[str, str], key: str, digits: str) -> str:
-    """Format a quantity of two solvers; a run that is not solved fails."""
+    """Format a quantity of two solvers; a run that is not solved is shown as failed."""
     shown = [
         format(row[name][key], digits)
         if row[name]["solved"] or key in ("first_call", "largest")

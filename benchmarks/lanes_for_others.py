@@ -1,16 +1,16 @@
-"""Programs that do not use nhjax, with `lanes.vmap` and `lanes.jit` beside JAX's own.
+"""Programs that do not use nhjax, by `lanes.vmap` and `lanes.jit`, compared with JAX.
 
 - Ensembles of the paper's chaotic system, written as 14 explicit equations, which
     diffrax integrates with adaptive steps.
 - A Kalman filter, and the classical Runge-Kutta method with fixed steps.
 - The mass matrix of a chain of joints, written out joint by joint, as in issue 26021 of
-    JAX, and the gradient of a scan that carries many scalars, as in issue 40150. They
-    are written after the descriptions there.
+    JAX, and the gradient of a scan that carries many scalars, as in issue 40150. Both
+    programs follow the descriptions in these issues.
 
-Each program is compiled by JAX and by nhjax, and both are run in turn. The table has
-the wall time of the fastest run, with all cores. The compile time is the time of the
-first call, including the trace. The difference is the largest of any number that comes
-out, relative to the largest of its array.
+Each program is compiled by JAX and by nhjax, and both versions are run in turn. The
+table has the wall time of the fastest run, with all cores. The compile time is the time
+of the first call, including the trace. The table also has the largest difference
+between the results of both, relative to the largest number of its array.
 
     python -m benchmarks.lanes_for_others
 """
@@ -62,7 +62,7 @@ def chaotic_field(t: Any, y: Any, args: Any) -> Any:
     q, v = y[:7], y[7:]
     first, second = q[1:4], q[4:7]
     squares = jnp.concatenate([jnp.zeros(1), second**2, first**2])
-    # The product of the first two squares of the second group.
+    # The product of the first two squares of the second group of coordinates.
     pair = jnp.array([0, 0, 0, 0, q[5] ** 2, q[4] ** 2, 0])
     slope = q * (1 + squares + pair)
     row = jnp.concatenate([jnp.array([1.0, 0.0, 0.0, 0.0]), second])

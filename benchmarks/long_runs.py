@@ -1,14 +1,15 @@
 """Machines over a long time: the balance of energy and work, and the constraints.
 
-Each machine of the gallery runs with three stages for about 1000 s, or as long as its
-motion lasts. The power of the forces, of the constraints that move and of what depends
-on time is integrated along the run by a spline of degree 7,
+Each machine of the gallery runs with three stages for 1000 s, except for Andrews'
+squeezer, which runs for 1 s. The balance of energy and work is
 
-    E(t) - E(0) = ∫ F·v + λᵀB v - ∂L/∂t dt,
+    E(t) - E(0) = ∫ F·v + λᵀB v - ∂L/∂t dt.
 
-and the largest residual of this balance, of the first tenth of the run and of all of
-it, is given relative to the largest kinetic energy. Where no power is named all of it
-vanishes, and the balance is the conservation of energy.
+The integrand is the power of forces, of moving constraints and of the explicit time
+dependence of L. It is integrated along the run by a spline of degree 7. The table has
+the largest residual of this balance in the first tenth of the run and in the whole run,
+relative to the largest kinetic energy. If the column of powers has "none", the
+integrand vanishes, and the balance is the conservation of energy.
 
     python -m benchmarks.long_runs
 """
@@ -30,10 +31,12 @@ from ._report import markdown_table, number, write
 
 DURATION = 1000.0
 STAGES = 3
-# The torque of its motor, constant and without friction, speeds the squeezer up.
+# The duration of the squeezer is shorter, because the constant torque of its motor
+# accelerates it without limit.
 SHORTER = {"AndrewsSqueezer": 1.0}
-# Steps of other runs are those of the pictures. Gaits speed their machines up, to 9 and
-# 60 m/s at the end, and the crank turns by 0.6 rad in a step of its picture.
+# Other machines use the step of their picture in the gallery. The machines below need
+# smaller steps: for instance, gaits accelerate their machines to 9 and 60 m/s, and the
+# crank turns by 0.6 rad in a step of its picture.
 FINER = {
     "Snakeboard": 0.01,
     "RollerRacer": 0.0025,
@@ -43,9 +46,9 @@ FINER = {
     "AndrewsSqueezer": 2e-5,
     "CarAxis": 0.005,
 }
-# How often the energy of a conservative run is looked at; others are after each step.
+# The number of saved energies of a conservative run. Other runs save each step.
 SAMPLES = 20_000
-# What does work on each machine that is not conservative.
+# The source of the work on each machine that is not conservative.
 POWERED = {
     "Snakeboard": "gait",
     "RollerRacer": "gait",
@@ -56,7 +59,7 @@ POWERED = {
 
 
 class Case(NamedTuple):
-    """A machine, the step and the duration of its run, and what does work on it."""
+    """A machine, the step and the duration of its run, and the source of work on it."""
 
     name: str
     example: Any
@@ -66,7 +69,7 @@ class Case(NamedTuple):
 
 
 def cases() -> list[Case]:
-    """The machines of the gallery, and some of them with forces."""
+    """Return the machines of the gallery, and variants of them with forces."""
     found = [
         Case(
             machine.name,
@@ -81,7 +84,8 @@ def cases() -> list[Case]:
         3.0, lean_rate=0.3, steering=systems.LeanToSteer()
     )
     (stone,) = (case for case in found if case.name == "Rattleback")
-    # The step of its picture does not last for so long.
+    # The rattleback also runs with larger steps. The step of its picture is too large
+    # for such a long run.
     found += [stone._replace(dt=dt) for dt in (0.002, 0.004)]
     damped = systems.Rattleback.spinning(5.0, (0.5, 0.5), damping=1e-4)
     found.insert(1, Case("WhippleBicycle, steered", rider, 0.02, DURATION, "rider"))
@@ -92,7 +96,7 @@ def cases() -> list[Case]:
 
 
 def balance(case: Case) -> dict[str, Any]:
-    """The row of a machine."""
+    """Run a machine, and return its row of the table."""
     system, y0 = case.example.system, case.example.initial_state()
     num_steps = round(case.duration / case.dt)
     every = 1 if case.power else max(1, num_steps // SAMPLES)
@@ -107,7 +111,7 @@ def balance(case: Case) -> dict[str, Any]:
             saveat=nhjax.SaveAt(t0=True, steps=every),
         )
 
-    # The first call compiles, with a second solver where the first one has failed.
+    # The first call compiles. If the first solver fails, it also compiles the second.
     jax.block_until_ready(run())
     start = time.process_time()
     sol = jax.block_until_ready(run())

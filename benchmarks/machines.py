@@ -1,8 +1,8 @@
-"""What the first call costs of each machine of the gallery, and whether it is right.
+"""The cost of the first call of each machine of the gallery, with a test of gradients.
 
-Time of the processor to trace, lower and compile a run with three stages and its
-gradient. The derivative of a run with respect to the step size is compared with a
-difference.
+The table has the processor time to trace, lower and compile a run with three stages,
+and the same for its gradient. The derivative of a run with respect to the step size is
+compared with finite differences.
 
     python -m benchmarks.machines
 """
@@ -20,7 +20,7 @@ from .compile_time import compiled, program
 
 
 def of_machine(machine: Machine) -> dict[str, Any]:
-    """The row of a machine."""
+    """Measure a machine, and return its row of the table."""
     system, y0 = machine.example.system, machine.example.initial_state()
     dt = jnp.asarray(machine.duration / machine.num_steps)
     run, run_parts = compiled(program(system, 3, "run"), y0, dt)

@@ -1,24 +1,27 @@
-"""Steps near rest, judged in 50 digits: is a refused step solved, an accepted one not?
+"""Steps near rest, judged in 50 digits: are solved steps refused, or others accepted?
 
-Near rest the numbers of a state are small, and the constants inside of the functions of
-a system, a wheel's radius or a weight, leave round-off of their own size. Each system
-starts from its reference with v scaled by 1e-8 to 1, and takes steps of four sizes over
-three decades with both solvers, compiled. All refused steps are judged, and a sample of
-the accepted steps.
+Near rest, velocities are small. The functions of a system also contain constants, such
+as a wheel's radius or a weight, whose round-off does not become small. Each system
+starts from its default state with v scaled by 1e-8 to 1, and takes steps of four sizes
+over three decades with both solvers, compiled. All refused steps are judged, and a
+sample of the accepted steps.
 
-A step is judged at the stages that the solver ended with, whether it accepts them or
-not. The stage equations are evaluated there in 50 digits. Newton's correction with
-these values is the distance from the solution; with what float64 misses of them, at the
-same stages and at four that are moved by a few units of the last digit, it is the noise
-which no iteration in float64 can remove. Both count in units of velocities, as in the
-solvers, and a unit of the last digit of the velocities is always noise. A refused step
-whose distance is at most `SOLVED` times the noise should have been accepted. An
-accepted one whose distance is more than `DOUBTFUL` times the noise is judged again: the
-distance by which the solution moves, if the position at the start of the step moves by
-one unit in the last place, is noise too, since float64 does not know a start better. If
-the distance is still more than `DOUBTFUL` times the noise, the step should have been
-refused. Where the noise is more than `DETERMINED` of the velocities, as with iterates
-that ran away, a refusal is never wrong.
+A step is judged at the last stages of the solver, whether it accepts them or not. The
+stage equations are evaluated there in 50 digits. Newton's correction with these values
+is the distance from the solution. The noise is the error that no iteration in float64
+can remove. It is Newton's correction for the errors of the float64 values, at the same
+stages and at four others that are moved by a few units of the last digit. Distance and
+noise are measured in units of velocities, as in the solvers, and the noise is at least
+one unit of the last digit of the velocities.
+
+A refused step whose distance is at most `SOLVED` times the noise should have been
+accepted. An accepted step whose distance is more than `DOUBTFUL` times the noise is
+judged again, with a larger noise: if the position at the start of the step moves by one
+unit in the last place, the solution moves too, and this distance now counts as noise,
+because float64 does not represent the start more accurately. If the distance is still
+more than `DOUBTFUL` times the noise, the step should have been refused. If the noise is
+more than `DETERMINED` times the velocities, for instance because iterates diverged, a
+refusal is never wrong.
 
     python -m benchmarks.near_rest
 """
@@ -72,10 +75,10 @@ class Tried(NamedTuple):
 
 
 class Distance(NamedTuple):
-    """How far stages are from the solution, and the noise, in units of velocities.
+    """The distance of stages from the solution, and the noise, in velocity units.
 
-    Without a `noise` that is small beside the size of the velocities, float64 has no
-    solution of the step.
+    `is_determined` is false if the noise is not small compared with the velocities.
+    Then float64 cannot determine the solution of the step.
     """
 
     distance: float
@@ -84,12 +87,12 @@ class Distance(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """The distance in units of the noise."""
+        """Return the distance in units of the noise."""
         return self.distance / self.noise if self.noise > 0 else np.inf
 
 
 def first_arguments(system, method, y0, h) -> StepArguments:
-    """Make the arguments of the first step of a run, as `integrate` does."""
+    """Create the arguments of the first step of a run, as `integrate` does."""
     zero = jnp.zeros_like(h)
     first = first_step_state(system, method, zero, y0, None)
     given = zero, y0.q, system.fibre_coordinate(y0), y0.multiplier, None, h
@@ -100,7 +103,7 @@ def first_arguments(system, method, y0, h) -> StepArguments:
 
 @eqx.filter_jit
 def steps(system, method, solver, y0, h) -> Tried:
-    """Take `NUM_STEPS` steps as `integrate` does; after one that fails, none."""
+    """Take `NUM_STEPS` steps as `integrate` does, and stop at a step that fails."""
     first = first_arguments(system, method, y0, h)
 
     def advance(carry, k):
@@ -160,9 +163,9 @@ def with_moved_start(arguments: StepArguments, rng: Any) -> StepArguments:
 def distance(
     method, arguments: StepArguments, x: StageUnknowns, *, with_start: bool = False
 ) -> Distance:
-    """Find how far stages are from the solution of their step, and the noise.
+    """Compute the distance of stages from the solution of their step, and the noise.
 
-    `with_start` includes the rounding of the position at the start.
+    With `with_start`, the noise includes the rounding of the position at the start.
     """
     z, unravel = ravel_pytree(x)
     z = np.asarray(z)
@@ -189,7 +192,8 @@ def distance(
     rng = np.random.default_rng(0)
     for _ in range(4):
         there = z * (1 + eps * rng.integers(-4, 5, z.size))
-        # The change of the equations by the move itself is no noise.
+        # Subtract the change of the equations that the move itself causes: it is not
+        # noise.
         r = equations(method, arguments, unravel(jnp.asarray(there)))
         missed.append(np.asarray(r) - jacobian @ (there - z) - exact)
         if with_start:
@@ -206,7 +210,7 @@ def distance(
 
 
 def examples() -> dict[str, Callable]:
-    """All systems of the gallery, each as a function of no arguments."""
+    """Return the systems of the gallery, each as a function without arguments."""
     made = {}
     for name in vars(systems):
         kind = getattr(systems, name)
@@ -218,9 +222,9 @@ def examples() -> dict[str, Callable]:
 def near_rest(
     name: str, stages: int, make: Callable, most: int
 ) -> Iterator[dict[str, Any]]:
-    """Measure one system with one number of stages, a row for each solver and scale.
+    """Measure one system with one number of stages; yield a row per solver and scale.
 
-    All refused steps, and at most so many accepted steps of a row, are judged in 50
+    All refused steps of a row, and at most `most` accepted steps, are judged in 50
     digits.
     """
     example = make()
@@ -230,8 +234,9 @@ def near_rest(
         int(getattr(nhjax.RESULTS, name)._value)
         for name in ("nonlinear_max_iterations", "nonlinear_divergence")
     }
-    # All steps have these functions and shapes. To find them the system is evaluated
-    # without compilation, which takes far longer than to judge a step.
+    # The functions and shapes in the arguments are the same for all steps. They are
+    # computed once, because `first_arguments` evaluates the system without compilation,
+    # which takes far longer than judging a step.
     first = first_arguments(system, method, y0, jnp.asarray(SIZES[0]))
     static = eqx.filter(first, _is_no_array)
     for solver_name, solver in SOLVERS.items():
@@ -266,7 +271,7 @@ def _is_no_array(x: Any) -> bool:
 
 
 def _judged(method, kept: dict[str, list], most: int) -> dict[str, Any]:
-    """Judge all refused steps, and some accepted ones that are spread evenly."""
+    """Judge all refused steps, and `most` accepted steps at even distances."""
     found: dict[str, Any] = {}
     for kind, them in kept.items():
         number = most if kind == "accepted" else len(them)
@@ -354,7 +359,7 @@ def main() -> None:
     add_keep(parser)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    # The programs run for seconds and would be optimised for minutes.
+    # The programs run only for seconds, but optimising them would take minutes.
     jax.config.update("jax_disable_most_optimizations", True)
     rows: list[dict[str, Any]] = []
     for name, make in examples().items():

@@ -1,8 +1,9 @@
-"""What redundant constraints cost.
+"""The cost of redundant constraints.
 
-A parallelogram is a body on two parallel cranks. A third crank is a constraint that
+A parallelogram is a body on two parallel cranks. A third crank adds a constraint that
 follows from the other two. The cart is a robot with a free root on two wheels and a
-sliding caster: its wheels cannot slip sideways, which is the same condition twice.
+sliding caster. Neither wheel can slip sideways, and these two constraints are the same
+condition, because the wheels share an axle.
 
     python -m benchmarks.redundant
 """

@@ -1,16 +1,16 @@
-"""Robots from model files, against MuJoCo's contacts and a model written by hand.
+"""Robots from model files, compared with MuJoCo's contacts and a model by hand.
 
 There are four measurements:
 
 1. A robot on two wheels and two casters that slide moves for 60 s without motors and
-   without damping, from the same state in nhjax and in MuJoCo. In MuJoCo its wheels
-   are geoms with contacts on a plane, of the default stiffness. The centre of mass is
+   without damping, from the same state in nhjax and in MuJoCo. In MuJoCo the wheels
+   are geoms with contacts of the default stiffness on a plane. The centre of mass is
    above the axle, so that the robot runs on a circle. The slip is the sideways velocity
    of the axle. The energy should not change.
-2. The first call of a run: the time of the processor to trace, to compile and to run,
-   and the memory of the process. The robot is a tree of 20 degrees of freedom without
-   wheels on the ground. The model written by hand is the same tree: it computes the
-   poses of all bodies with `vmap` over the legs, and their velocities with `jax.jvp`.
+2. The first call of a run: the processor time to trace, to compile and to run, and the
+   memory of the process. The robot is a tree of 20 degrees of freedom without wheels on
+   the ground. The model written by hand describes the same tree: it computes the poses
+   of all bodies with `vmap` over the legs, and their velocities with `jax.jvp`.
 3. A run of 64 robots by `vmap`, compared with one robot.
 4. The gradient with respect to the mass of a link, compared with central differences.
 
@@ -44,7 +44,7 @@ mujoco: Any = importlib.import_module("mujoco")
 
 DURATION, STEP = 60.0, 0.02
 METHOD = nhjax.LobattoIIIAB(2)
-# The first saved state after 2 s.
+# The index of the state that is saved at t = 2 s.
 SETTLED = 10
 START = {"x": 0.5, "heading": 0.4}
 MEMBERS = 64
@@ -77,13 +77,13 @@ _SLIDES = 'condim="1" priority="1"'
 
 
 def wheeled(root: str, has_contacts: bool) -> Any:
-    """Compile the robot on two wheels and a sliding caster."""
+    """Compile the robot on two wheels and two sliding casters."""
     text = _WHEELED.format(root=root, c=int(has_contacts), slides=_SLIDES)
     return mujoco.MjSpec.from_string(text).compile()
 
 
 def beside_mujoco() -> tuple[str, dict[str, Any]]:
-    """Measure slip and energy of both over the same time."""
+    """Measure slip and energy in nhjax and in MuJoCo over the same time."""
     model: Any = wheeled(_PLANAR, False)
     robot = nhjax.from_mujoco(model, rolling=["left", "right"])
     speed, turning = START["x"], START["heading"]
@@ -390,7 +390,7 @@ def measure_ensemble() -> tuple[str, dict[str, Any]]:
 
 
 def measure_gradient() -> tuple[str, dict[str, Any]]:
-    """Compare the gradient with respect to a mass with differences."""
+    """Compare the gradient with respect to a mass with finite differences."""
     robot = nhjax.example_robot("balancing_robot", parameters={"mass": ["body"]})
     y0 = robot.initial_state({"pitch": 0.1})
 

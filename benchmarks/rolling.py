@@ -1,26 +1,27 @@
-"""Rolling machines from parts, against closed forms and published numbers.
+"""Rolling machines from parts, compared with closed forms and published numbers.
 
 All constraints come from `nhjax.rolling`. There are six measurements:
 
 1. A disc rolls steadily on a circle, with the numbers of Le Saux, Leine and Glocker
    (2005): a thin rim, inclined by 5 degrees. The motion is known in closed form. Errors
    of positions, velocities and the contact force must fall with the order 2s - 2.
-2. Euler's disc, 400 g and 37.5 mm, comes to rest. Its inclination is β = c (t_f - t)^p
-   near the end. The exponent p depends on what takes its energy. Four laws are run:
-   `friction.RollingResistance`, dry and viscous friction of the contact that runs
-   around the rim, and a layer of air, as in Moffatt (2000), who found p = 1/3. For each
-   law the balance of energy gives c and p: E = 3/2 m g r β, with the precession Ω² =
-   4 g / (r β). The power is N e 2 (g β / r)^½ of the first law, N e Ω and k Ω² of
-   friction along the rim, and π μ r³ Ω² / 4 β of the air.
+2. Euler's disc, with the mass 400 g and the radius 37.5 mm, comes to rest at a time
+   t_f. Its inclination is β = c (t_f - t)^p near the end. The exponent p depends on the
+   law of dissipation. Four laws are run: `friction.RollingResistance`, dry and viscous
+   friction of the contact that runs around the rim, and a layer of air, as in Moffatt
+   (2000), who found p = 1/3. For each law the balance of energy gives c and p, with
+   E = 3/2 m g r β and the precession Ω² = 4 g / (r β). The dissipated power is
+   N e 2 (g β / r)^½ for the first law, N e Ω for dry and k Ω² for viscous friction
+   along the rim, and π μ r³ Ω² / 4 β for the air.
 3. A robot on four mecanum wheels is commanded sideways through four motors. It must not
    turn, and its path is known in closed form.
 4. A homogeneous ball on an inclined plane, on a turntable and in a spherical bowl, each
    with a motion in closed form.
-5. A snakeboard from blades or from wheels, against the one of the gallery.
-6. The bicycle of Meijaard et al. (2007): its eigenvalues against those in print, and
-   the time of the first call, compared with the bicycle of the gallery.
+5. A snakeboard from blades or from wheels, compared with the snakeboard of the gallery.
+6. The bicycle of Meijaard et al. (2007): its eigenvalues compared with the published
+   ones, and the time of the first call, compared with the bicycle of the gallery.
 
-Errors are the largest of all components, at the end of a run.
+An error is the largest error of all components at the end of a run.
 
     python -m benchmarks.rolling
 """
@@ -50,7 +51,7 @@ from .compile_time import compiled, program
 GRAVITY = 9.81
 SE3, SO3 = nhjax.SE3(), nhjax.SO3()
 X, Y, Z = np.eye(3)
-# Smaller errors show no order.
+# Errors below this bound are not used for observed orders.
 ROUND_OFF = 1e-11
 
 
@@ -62,7 +63,7 @@ class Machine(NamedTuple):
 
 
 def pose_of_body(t: Any, q: Array, args: Any) -> tuple[Array, Array]:
-    """Return the place and the rotation of a body on SE(3)."""
+    """Return the position and the rotation of a body on SE(3)."""
     return q[4:], SO3.matrix(q[:4])
 
 
@@ -74,7 +75,7 @@ def body(
 ) -> Machine:
     """Create a rigid body on SE(3) with one contact and weight.
 
-    `force` is a function that makes the force from the contacts.
+    `force` is a function that creates the force from the contacts.
     """
     contacts = rolling.Contacts(body=contact)
     inertia = np.array([mass, mass, mass, *moments])
@@ -112,7 +113,7 @@ class Motion(NamedTuple):
     def errors(self, machine: Machine, t: float, y: nhjax.State) -> list[float]:
         """Return the errors of position, velocity and contact force of a state.
 
-        Where the rotation is not known, it is left out.
+        If the rotation of the motion is not known, its error is left out.
         """
         found = np.asarray(SO3.matrix(y.q[:4]))
         velocity, angular = np.asarray(y.v).reshape(2, 3) @ found.T
@@ -136,7 +137,7 @@ def end_of(sol: nhjax.Solution) -> nhjax.State:
 def orders(rows: list[list[float]]) -> list[list[float]]:
     """Return the observed orders of errors, each row with half the step size.
 
-    Errors of the size of round-off have none.
+    The order is not defined if an error has the size of round-off.
     """
     errors = np.maximum(np.array(rows), ROUND_OFF)
     found = np.log2(errors[:-1] / errors[1:])
@@ -245,7 +246,8 @@ def rolling_disc() -> Machine:
 def unsteadiness() -> float:
     """Return the error of the accelerations at the start.
 
-    In the steady motion the body velocity turns about the axle at the rate -γ'.
+    In the steady motion, the vector of the body velocity rotates about the axle at the
+    rate -γ'. This gives the exact accelerations.
     """
     machine = rolling_disc()
     y0 = nhjax.initial_state(machine.system, *steady_disc(0.0).start())
@@ -287,7 +289,7 @@ EULER_MASS, EULER_RADIUS = 0.4, 0.0375
 FIRST_BETA = 0.1
 AIR_VISCOSITY = 1.8e-5
 ROLLING_ARM, RIM_ARM, RIM_DAMPING = 1e-4, 5e-6, 5e-8
-# States are saved after so many steps of the longer ones.
+# States are saved after this number of steps with the longer step size.
 SAVED = 5
 
 
@@ -333,10 +335,11 @@ def viscous_rim(contacts: rolling.Contacts) -> Any:
 
 
 def layer_of_air(contacts: rolling.Contacts) -> Any:
-    """Return the torque of the air that the disc squeezes, with Moffatt's power.
+    """Return the torque of the air under the disc, with Moffatt's dissipated power.
 
     The power is π μ r³ Ω² / 4 β. The disc itself turns at the rate Ω β about the
-    diameter to the contact, so that the torque against this turning grows with 1 / β³.
+    diameter to the contact. The torque about this diameter is the power divided by the
+    rate, and is proportional to the rate with a factor that grows like 1 / β³.
     """
     damping = math.pi * AIR_VISCOSITY * EULER_RADIUS**3 / 4
 
@@ -353,7 +356,7 @@ def layer_of_air(contacts: rolling.Contacts) -> Any:
 class Decay(NamedTuple):
     """A law of dissipation: c and p of β = c (t_f - t)^p, and the run that finds them.
 
-    `force` makes the force from the contacts. The longer of two step sizes is `dt`.
+    `force` creates the force from the contacts. `dt` is the longer of two step sizes.
     """
 
     name: str
@@ -364,14 +367,14 @@ class Decay(NamedTuple):
 
     @property
     def duration(self) -> float:
-        """Return the time to rest by the law, and a little more."""
+        """Return the time at which the law predicts rest, plus 3 percent."""
         return 1.03 * (FIRST_BETA / self.constant) ** (1 / self.power)
 
     @property
     def last_beta(self) -> float:
-        """Return β where the law would need the vertical acceleration g.
+        """Return the β at which the law requires the vertical acceleration g.
 
-        The law follows from slow changes of a steady motion, and ends there.
+        The law assumes slow changes of a steady motion, and is not valid for smaller β.
         """
         c, p = self.constant, self.power
         if p >= 1:
@@ -441,7 +444,7 @@ def spin_down(decay: Decay, dt: float, saved: int) -> Record:
         dt=dt,
         num_steps=round(decay.duration / dt),
         saveat=nhjax.SaveAt(t0=True, steps=saved),
-        # Each run ends in a singularity, where Newton's method does not help.
+        # Each run ends in a singularity, where Newton's method would fail too.
         stage_solver=nhjax.SimplifiedNewton(fallback=False),
         throw=False,
     )
@@ -482,7 +485,8 @@ def fit(record: Record, smallest: float, largest: float) -> Fit:
     def residuals(z):
         return logs - np.polyval(np.polyfit(left(z), logs, 1), left(z))
 
-    # The time of the end enters nonlinearly, hence several starts.
+    # The residuals depend nonlinearly on the time of the end, so that several initial
+    # values are tried.
     found = min(
         (
             scipy.optimize.least_squares(residuals, [z], xtol=1e-14, ftol=1e-14)
@@ -500,7 +504,7 @@ def measure_decay(decay: Decay) -> dict[str, Any]:
     fine = spin_down(decay, decay.dt / 2, 2 * SAVED)
     smallest = resolved(coarse, fine)
     lowest = max(2 * smallest, 3 * decay.last_beta)
-    # A little after the start, where the friction sets in at once.
+    # The fit begins a little after the start, because the friction starts suddenly.
     highest = 0.8 * FIRST_BETA
     found = fit(fine, lowest, highest)
     return {
@@ -566,7 +570,8 @@ ROBOT_MASS, ROBOT_INERTIA, WHEEL_INERTIA = 10.0, 0.4, 0.01
 ROBOT_WHEEL, HALF_LENGTH, HALF_WIDTH = 0.05, 0.2, 0.15
 STALL_TORQUE, NO_LOAD_SPEED, GEAR = 0.05, 400.0, 25.0
 ROBOT_DURATION, COMMAND, HEADING = 3.0, 0.5, 0.3
-# Ahead, left, the side to which the rollers point, and the turn in a sideways motion.
+# For each wheel, the signs of its position ahead and to the left, of the angle of its
+# rollers, and of its turn in a sideways motion.
 CORNERS = ((1, 1, -1, -1), (1, -1, 1, 1), (-1, 1, 1, 1), (-1, -1, -1, -1))
 
 
@@ -608,7 +613,7 @@ def mecanum_robot() -> Machine:
 
 
 def sideways(t: float) -> tuple[float, float]:
-    """Return the way and the speed of the robot, to its left, in closed form."""
+    """Return the displacement and the speed of the robot to its left, exactly."""
     mass = ROBOT_MASS + 4 * WHEEL_INERTIA / ROBOT_WHEEL**2
     damping = 4 * GEAR**2 * STALL_TORQUE / (NO_LOAD_SPEED * ROBOT_WHEEL**2)
     last, rate = ROBOT_WHEEL * COMMAND * NO_LOAD_SPEED / GEAR, damping / mass
@@ -691,7 +696,7 @@ def ball_on(ground: rolling.AbstractGround) -> Machine:
 def on_incline(normal: np.ndarray, t: float) -> Motion:
     """Return the ball on an inclined plane through the origin: a = 5/7 g sin α.
 
-    It starts across the slope, with a spin about the normal, which it keeps.
+    The ball starts across the slope, with a spin about the normal, which is constant.
     """
     n = normal / np.linalg.norm(normal)
     pull = GRAVITY * (n[2] * n - Z)
@@ -734,11 +739,12 @@ def in_bowl(t: float) -> Motion:
     normal = np.array([-sine, 0.0, cosine])
     velocity = BOWL_RATE * np.cross(Z, first)
     force = BALL_MASS * (BOWL_RATE * np.cross(Z, velocity) + GRAVITY * Z)
-    # The contact moves with the bowl: ẋ - ω × a n = Ω z × (x - a n).
+    # The contact point of the ball moves with the bowl: ẋ - ω × a n = Ω z × (x - a n).
     slip = velocity - BOWL_TURNING * np.cross(Z, first - BALL_RADIUS * normal)
     angular = np.cross(normal, slip) / BALL_RADIUS
     torque = np.cross(-BALL_RADIUS * normal, force)
-    # ω turns about the axis: I Ω' z × ω is the torque, along the path.
+    # ω rotates about the z axis at the rate Ω' of the path. Therefore I Ω' z × ω is the
+    # torque, which is along the path.
     missing = torque[1] / (BALL_INERTIA * BOWL_RATE) - angular[0]
     angular = angular + missing / normal[0] * normal
     # The rotation is uniform for an observer who moves with the ball.
@@ -886,9 +892,9 @@ def measure_boards() -> tuple[str, dict[str, Any]]:
 
 # --- 6. The bicycle -------------------------------------------------------------------
 
-# Meijaard et al. (2007), table 2, at 0, 1, ... 10 m/s: two real eigenvalues and a pair,
-# which is real at rest. In 50 digits, the linear equations have these to 1e-13 but for
-# 18.15788466125202 at 7 m/s.
+# Meijaard et al. (2007), table 2, at 0, 1, ... 10 m/s: two real eigenvalues and a
+# complex pair; at rest all four are real. The linear equations, solved in 50 digits,
+# give the same numbers up to 1e-13, with one exception: -18.15788466125202 at 7 m/s.
 EIGENVALUES = (
     (-5.53094371765393, -3.13164324790656, 3.13164324790656, 5.53094371765393),
     (-7.11008014637442, -3.13423125066578, 3.52696170990070 + 0.8077402751993j),
@@ -925,7 +931,7 @@ def bicycle_from_parts() -> Machine:
 
         return rolling.Wheel(pose, radius, ground=ground, touches=touches)
 
-    # The coordinates put the rear wheel on the ground.
+    # The coordinates are such that the rear wheel is always on the ground.
     contacts = rolling.Contacts(
         rear=wheel(0, bicycle.rear_radius, False),
         front=wheel(1, bicycle.front_radius, True),
@@ -945,7 +951,8 @@ def errors_of_eigenvalues(system: nhjax.LagrangianSystem) -> list[float]:
     def eigenvalues(speed):
         start = systems.WhippleBicycle.running(speed)
         y = nhjax.State(start.q0, start.v0, jnp.zeros(8), jnp.zeros(5))
-        # Lean, steer, their rates and the speed. The motion is steady by construction.
+        # The independent coordinates are lean and steer, and the independent velocities
+        # their rates and the speed. The motion is steady by construction.
         return nhjax.linear_stability(
             system,
             0.0,
@@ -958,7 +965,7 @@ def errors_of_eigenvalues(system: nhjax.LagrangianSystem) -> list[float]:
     errors = []
     for speed, printed in enumerate(published_eigenvalues()):
         found = np.asarray(eigenvalues(float(speed)))
-        # The speed itself has the eigenvalue zero.
+        # Perturbations of the speed have the eigenvalue zero, which is removed.
         found = np.sort_complex(np.delete(found, np.argmin(np.abs(found))))
         errors.append(float(np.max(np.abs(found - printed))))
     return errors
@@ -983,7 +990,7 @@ def measure_bicycle() -> tuple[str, dict[str, Any]]:
     }
     jax.clear_caches()
     seconds: dict[str, list[float]] = {"gallery": [], "parts": []}
-    # The processes take turns, since the load of the machine changes.
+    # The processes run in turn, because the load of the machine changes.
     for _ in range(FIRST_CALLS):
         for name, found in seconds.items():
             found.append(from_fresh_process("rolling", "--first-call", name))

@@ -1,17 +1,19 @@
-"""What a step costs against s, n, the constraints, the batch and the number of steps.
+"""The cost of a step as a function of sizes, one axis for each varied size.
 
-The system is the chaotic one with n = 2m + 1 coordinates, except for the number of
-constraints, which has three families: skates with a diagonal mass matrix, a chain of
-pendula (each link shares coordinates with two others, so that C = B M⁻¹ Bᵀ is
-tridiagonal), and a star of rods on one body (C is full).
+The axes are the number of stages s, the number of coordinates n, the number of
+constraints, the size of a batch, and the number of steps. The system is the chaotic
+system with n = 2m + 1 coordinates. Only the number of constraints is varied in three
+other families of systems: skates with a diagonal mass matrix, a chain of pendula (each
+link shares coordinates with two others, so that C = B M⁻¹ Bᵀ is tridiagonal), and a
+star of rods on one body (C is full).
 
 Compile time is separate from run time. Run times are medians of seven. The runs of one
-axis are interleaved, so that other load on the machine affects all of them; the
-smallest of the seven is given too, and shows the noise.
+axis are interleaved, so that other load on the machine affects all of them. The table
+also has the smallest of the seven times, which shows the noise.
 
-Exponents are slopes in logarithms: from the first point of the range to its last, and
-fitted to all of them. Iterations per step are given too, since a change of either is a
-change of cost. `--smoke` takes a minute.
+Exponents are slopes in logarithms: the slope from the first to the last point of the
+range, and the slope of a fit to all points. The table also has the iterations per step,
+because the cost of a step depends on their number. `--smoke` takes a minute.
 """
 
 import argparse
@@ -38,7 +40,7 @@ H, STAGES, REPEATS = 0.1, 3, 7
 
 
 class Problem(NamedTuple):
-    """One point of an axis: what is integrated, and over how many steps."""
+    """One point of an axis: a system, its method, and the number of steps."""
 
     size: int
     system: nhjax.LagrangianSystem
@@ -50,7 +52,7 @@ class Problem(NamedTuple):
 
 
 class Axis(NamedTuple):
-    """What is varied."""
+    """A size that is varied, with one problem for each of its values."""
 
     name: str
     label: str
@@ -59,10 +61,11 @@ class Axis(NamedTuple):
 
 
 def chaotic(m: int) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
-    """The chaotic system of m masses, at a start that does not stiffen with m.
+    """Create the chaotic system, with a start at which it does not stiffen with m.
 
-    q_2..q_{m+1} fill the range that they have for m = 3; the gallery's m/5..1/5 would
-    raise the frequencies with m, and with them the number of iterations.
+    At the start, q_2..q_{m+1} are from 0.6 to 0.2, as for m = 3. The gallery starts
+    from m/5..1/5, which would raise the frequencies for larger m, and therefore the
+    number of iterations.
     """
     q = np.array(systems.ChaoticSystem(m).q0)
     q[1 : m + 1] = np.linspace(0.6, 0.2, m)
@@ -71,7 +74,10 @@ def chaotic(m: int) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
 
 
 def members_of(count: int) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
-    """The system and `count` members of the paper's ensemble; one has no batch axis."""
+    """Return the chaotic system and `count` members of the paper's ensemble.
+
+    A single member has no batch axis.
+    """
     example = systems.ChaoticSystem()
     if count == 1:
         return example.system, example.initial_state()
@@ -81,10 +87,10 @@ def members_of(count: int) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
 
 
 def skates(n: int, k: int) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
-    """n coordinates with diagonal masses, and k <= n / 2 constraints linear in v.
+    """Create a system with a diagonal mass matrix and k <= n / 2 constraints.
 
-    L = ½ Σ μ_i v_i² - ½ |q|² and Φ_a = v_a - q_{n/2+a} v_{n/2+a+1}: skates, each of
-    which steers the next.
+    L = ½ Σ μ_i v_i² - ½ |q|² and Φ_a = v_a - q_{n/2+a} v_{n/2+a+1}. The constraints are
+    like those of skates, each of which steers the next.
     """
     half = n // 2
     masses = np.linspace(1.0, 2.0, n)
@@ -103,14 +109,14 @@ def skates(n: int, k: int) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
 
 
 def chain(n: int) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
-    """A chain of n links at rest, whose rods point in slightly different directions."""
+    """Create a chain of n links at rest, with rods in slightly different directions."""
     angles = tuple(0.5 + 0.3 * np.sin(np.arange(n)))
     example = systems.PendulumChain.swinging(angles)
     return example.system, example.initial_state()
 
 
 def star(n: int) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
-    """A free body with n masses on rods, which turn about it."""
+    """Create a free body with n masses on rods, which turn about the body."""
 
     def lagrangian(t, q, v, args):
         return 0.5 * v @ v - 9.81 * jnp.sum(q[1::2])
@@ -128,7 +134,7 @@ def star(n: int) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
 
 
 def axes(smoke: bool) -> list[Axis]:
-    """What is measured."""
+    """Return the axes that are measured."""
     stages = [2, 3] if smoke else list(range(2, 9))
     masses = [3, 5] if smoke else [2, 3, 5, 10, 20, 35, 50]
     constraints = [1, 2] if smoke else [1, 2, 5, 10, 20]
@@ -181,7 +187,7 @@ def axes(smoke: bool) -> list[Axis]:
                     count,
                     *members_of(count),
                     members=count,
-                    # The largest batches make few steps, to stay within minutes.
+                    # The largest batches take few steps, to finish within minutes.
                     num_steps=max(min(num_steps, 2 * 10**5 // count), 3),
                 )
                 for count in batches
@@ -192,14 +198,14 @@ def axes(smoke: bool) -> list[Axis]:
             "N",
             "number of steps N",
             [Problem(count, *chaotic(3), num_steps=count) for count in steps],
-            # Shorter runs show what a call costs.
+            # In shorter runs, the overhead of a call would dominate.
             fitted_from=steps[0] if smoke else 10**3,
         ),
     ]
 
 
 def run(problem: Problem) -> Callable[[nhjax.State], tuple[Any, Array]]:
-    """The run of a problem, as a function of the state at the start."""
+    """Return the run of a problem, as a function of the initial state."""
 
     def one(y0: nhjax.State) -> tuple[Any, Array]:
         sol = nhjax.integrate(
@@ -217,7 +223,7 @@ def run(problem: Problem) -> Callable[[nhjax.State], tuple[Any, Array]]:
 
 
 def measure(axis: Axis) -> list[dict[str, Any]]:
-    """Compile time, time and iterations of each problem of an axis."""
+    """Measure the compile time, time and iterations of each problem of an axis."""
     programs, rows = [], []
     for problem in axis.problems:
         jax.clear_caches()
@@ -245,7 +251,7 @@ def measure(axis: Axis) -> list[dict[str, Any]]:
 
 
 def exponents(axis: Axis, rows: list[dict[str, Any]], key: str) -> dict[str, float]:
-    """The slope from the first to the last point of the range, and that of a fit."""
+    """Compute the slope from the first to the last point, and the slope of a fit."""
     used = [row for row in rows if row["size"] >= axis.fitted_from]
     x = np.log([row["size"] for row in used])
     y = np.log([row[key] for row in used])
@@ -256,7 +262,7 @@ def exponents(axis: Axis, rows: list[dict[str, Any]], key: str) -> dict[str, flo
 
 
 def table(axis: Axis, rows: list[dict[str, Any]]) -> str:
-    """The figures of an axis; local slopes are those from the line before."""
+    """Write the table of an axis; a local slope is the slope from the line above."""
     lines = []
     for k, row in enumerate(rows):
         before = rows[k - 1]
@@ -280,7 +286,7 @@ def table(axis: Axis, rows: list[dict[str, Any]]) -> str:
 
 
 def summary(measured: list[tuple[Axis, list[dict[str, Any]]]]) -> str:
-    """The exponents."""
+    """Write the table of exponents."""
     lines = []
     for axis, rows in measured:
         line = [axis.name, f"{axis.fitted_from} to {rows[-1]['size']}"]
@@ -292,7 +298,7 @@ def summary(measured: list[tuple[Axis, list[dict[str, Any]]]]) -> str:
 
 
 def draw(measured: list[tuple[Axis, list[dict[str, Any]]]], path: Path) -> None:
-    """The time of a step along each axis, and compile times along all."""
+    """Plot the time of a step along each axis, and the compile times of all axes."""
     figure = Figure(figsize=(14, 6), layout="constrained")
     panels = figure.subplots(2, 4).ravel()
     for k, (ax, (axis, rows)) in enumerate(zip(panels, measured, strict=False)):
@@ -328,7 +334,7 @@ def main() -> None:
     parser.add_argument("--smoke", action="store_true", help="little, and not saved")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    # The first compilation of a process pays for starting the compiler.
+    # The first compilation of a process also starts the compiler, and is not measured.
     jax.jit(jnp.sin).lower(1.0).compile()
     measured = []
     for axis in axes(options.smoke):

@@ -1,10 +1,10 @@
-"""What the first call of a model from SymPy costs, beside the same one written by hand.
+"""The cost of the first call of a SymPy model, compared with the model by hand.
 
-Time of the processor to trace, lower and compile a run with three stages and its
-gradient: of a particle with three coordinates, and of the bicycle of SymPy's tests with
-eight, each with its constraints. The models by hand are those of the gallery. Each
-first call has a process of its own, since a later call would find programs of an
-earlier call. The least of several times counts.
+The table has the processor time to trace, lower and compile a run with three stages,
+and its gradient. The models are a particle with three coordinates, and the bicycle of
+SymPy's tests with eight coordinates, both with constraints. The models by hand are from
+the gallery. Each first call runs in its own process, because a later call could reuse
+programs of an earlier call. The table has the least of several times.
 
     python -m benchmarks.sympy_models
 """
@@ -31,7 +31,7 @@ SPEED = 5.0
 
 
 class Pair(NamedTuple):
-    """The same model by hand and from SymPy: systems with their starts."""
+    """The same model by hand and from SymPy: systems with their initial states."""
 
     name: str
     size: int
@@ -41,7 +41,7 @@ class Pair(NamedTuple):
 
 
 def particles() -> Pair:
-    """The particle of the gallery."""
+    """Create both models of the particle of the gallery."""
     before = time.process_time()
     model = sympy_models.particle()
     importing = time.process_time() - before
@@ -52,7 +52,7 @@ def particles() -> Pair:
 
 
 def bicycles() -> Pair:
-    """The bicycle of Meijaard et al., upright."""
+    """Create both models of the upright bicycle of Meijaard et al."""
     before = time.process_time()
     model = sympy_models.bicycle()
     importing = time.process_time() - before
@@ -64,7 +64,7 @@ def bicycles() -> Pair:
 
 
 def _fixed(model: nhjax.SymPyModel) -> nhjax.LagrangianSystem:
-    """The system of a model with its parameters, which `args` would be."""
+    """Return the system of a model with fixed parameters, in place of `args`."""
     system, args = model.system, model.args
     force, holonomic, nonholonomic = system.force, system.holonomic, system.nonholonomic
     assert force is None
@@ -77,7 +77,7 @@ def _fixed(model: nhjax.SymPyModel) -> nhjax.LagrangianSystem:
 
 
 def seconds(system: Any, y0: nhjax.State, kind: str) -> float:
-    """The seconds of the processor of a first call."""
+    """Measure the processor time of a first call, in seconds."""
     _, parts = compiled(program(system, 3, kind), y0, jnp.asarray(0.05))
     return sum(parts)
 
@@ -87,7 +87,7 @@ FORMS = "by hand", "from SymPy"
 
 
 def measure(name: str, form: str, kind: str) -> None:
-    """Print the seconds of a first call and of the import, in this process."""
+    """Print the times of a first call and of `from_sympy`, in this process."""
     jax.jit(jnp.sin).lower(0.1).compile()
     pair = PAIRS[name]()
     model = pair.by_hand if form == FORMS[0] else pair.imported

@@ -1,10 +1,11 @@
 """The claims of the paper's sections 5 and 7, each measured, with a verdict.
 
-Writes the table to `benchmarks/results/verdicts.md` and `.json`, and into the page
-`docs/experiments.md`, whose figures go to `docs/experiments/`. With `--quick`
-everything runs in a small form, which shows that it runs but decides nothing, and with
-`--only` some parts alone; then nothing is written, unless `--keep` takes the other
-parts from the saved table. It takes about seven minutes of one core.
+The command writes the table to `benchmarks/results/verdicts.md` and `.json`, and into
+the page `docs/experiments.md`, whose figures go to `docs/experiments/`. It takes about
+seven minutes on one core. With `--quick` all parts run in a small form, which tests
+that they run, but does not decide any claim. With `--only` some parts run alone. With
+one of these options no file is written; but `--only` with `--keep` writes the files,
+and takes the other parts from the saved table.
 """
 
 import argparse
@@ -43,7 +44,8 @@ def measure(
         data |= found.data
         figures |= found.figures
         data[f"{part}_cpu_seconds"] = time.process_time() - start
-        # Compiled programs hold memory maps, of which a process has only so many.
+        # Each compiled program uses memory maps, and a process can have only a limited
+        # number of them.
         jax.clear_caches()
     return claims, data, figures
 
@@ -54,7 +56,7 @@ def table(claims: list[Claim]) -> str:
 
 
 def filled(page: str, claims: dict[str, list[Claim]]) -> str:
-    """Put the tables into the places of a page that wait for them."""
+    """Put the tables into a page, between the marks of each part."""
     for part, lines in claims.items():
         start, end = f"<!-- verdicts: {part} -->\n", "<!-- end -->"
         before, _, rest = page.partition(start)
@@ -66,7 +68,7 @@ def filled(page: str, claims: dict[str, list[Claim]]) -> str:
 def with_saved(
     claims: dict[str, list[Claim]], data: dict[str, Any]
 ) -> tuple[dict[str, list[Claim]], dict[str, Any]]:
-    """Take what was not measured now from the saved table."""
+    """Add the claims and data of parts that were not measured from the saved table."""
     saved = json.loads((RESULTS / "verdicts.json").read_text(encoding="utf-8"))
     others = {
         part: [Claim(**line) for line in lines]

@@ -1,29 +1,29 @@
-"""The wheelset of the Test Set for IVP Solvers: a run of 10 s against published digits.
+"""The wheelset of the Test Set for IVP Solvers: a run of 10 s, and published numbers.
 
 Two conical wheels on one axle run at 30 m/s on two round rails, and hunt from side to
 side. The test set (https://archimede.dm.uniba.it/~testset, problem `wheel`, from
-Simeon, Führer and Rentrop 1991) has this machine as an implicit equation of index 2
-with 17 unknowns: five coordinates, six velocities, four variables of the contacts, and
-two multipliers. The creep forces of the contacts depend on the normal forces, which are
-multipliers. The start is at rest in the moving frame, 1.5 mm beside the middle.
+Simeon, Führer and Rentrop 1991) describes this machine by an implicit equation of index
+2 with 17 unknowns: five coordinates, six velocities, four variables of the contacts,
+and two multipliers. The creep forces of the contacts depend on the normal forces, which
+are multipliers. The start is at rest in the moving frame, 1.5 mm beside the middle.
 
-For nhjax the machine has the coordinates q = (x, y, z, θ, φ, β): the place of the
-centre, the yaw, the roll, and the turn of the axle beyond V t / r. The two contacts are
-holonomic constraints, and the creep force is a force of the multipliers. The variables
-of the contacts have no mass. They are solved inside the constraint: the profiles are a
-cone and a circle, so that there is a closed form.
+In nhjax the coordinates are q = (x, y, z, θ, φ, β): the position of the centre, the
+yaw, the roll, and the turn of the axle beyond V t / r. The two contacts are holonomic
+constraints, and the creep force is a force that depends on the multipliers. The
+variables of the contacts have no mass. They are computed inside the constraint: the
+profiles are a cone and a circle, so that a closed form exists.
 
-Three details come from the test set. Its start leaves gaps of 5e-10 m, which its
-equations on velocities keep; here they are the `args` of the constraint. Creep is
-evaluated at the yaw θ / cos δ, and π has eight digits. In one detail it differs: the
-test set does not divide the yaw torque of the reactions by cos φ. This changes the
-result by less than 1e-7.
+Three details are copied from the test set. Its start has gaps of 5e-10 m between wheels
+and rails, which stay constant because its constraints are equations on velocities. Here
+these gaps are the `args` of the constraint. Creep is evaluated at the yaw θ / cos δ,
+and π has eight digits. One detail is different here: the test set does not divide the
+yaw torque of the reactions by cos φ. This changes the result by less than 1e-7.
 
-The errors are relative errors at the end, the largest of the 17 unknowns: against the
-published numbers, and against two references of our own. These are a run with small
-steps, and diffrax's Dopri8 on the equations solved for the accelerations. Errors fall
-slower than with the order of the method, since the creep force has a kink where a wheel
-begins to slide. That happens often.
+The errors are relative errors at the end, the largest of the 17 unknowns. They are
+given relative to the published numbers and to two references of our own: a run with
+small steps, and diffrax's Dopri8 on the equations solved for the accelerations. Errors
+fall more slowly than the order of the method predicts, because the creep force has a
+kink where a wheel begins to slide, which happens often.
 
     python -m benchmarks.wheelset
 """
@@ -51,7 +51,7 @@ RUNS = (
     *((4, 10000), (4, 40000), (4, 160000)),
     *((5, 10000), (5, 40000)),
 )
-# The runs whose errors are listed for each unknown.
+# The report lists the errors of each unknown for these runs.
 SHOWN = ((3, 10000), (3, 40000), (3, 160000), (3, 640000))
 REFERENCE = (4, 640000)
 TOLERANCE = 1e-12
@@ -69,7 +69,7 @@ FRICTION = 0.12
 CONE_ANGLE = 0.0262
 HALF_GAUGE = 0.1506
 RAIL_RADIUS = 0.06
-# The area of contact, by Hertz, and the creep coefficients, by Kalker.
+# Constants of Hertz's formula for the area of contact, and Kalker's creep coefficients.
 SHEAR_MODULUS, POISSON = 7.92e10, 0.28
 HERTZ_E, HERTZ_G = 1.3537956, 0.7115218
 KALKER_11, KALKER_22, KALKER_23 = 4.72772197, 4.27526987, 1.97203505
@@ -78,7 +78,7 @@ PI = 3.1415926
 SIDES = np.array([1.0, -1.0])
 START = np.array([1.4941e-3, 4.0089e-7, 1.1241e-6, -2.8573e-4, 2.6459e-4, 0.0])
 
-# The order of the test set. Its left contact has x > 0.
+# The order of the unknowns in the test set, whose left contact has x > 0.
 PUBLISHED = {
     "x": 0.86355386965811e-2,
     "y": 0.13038281022727e-4,
@@ -111,11 +111,11 @@ def lagrangian(t: Array, q: Array, v: Array, args: Any) -> Array:
 
 
 class Contact(NamedTuple):
-    """A contact of wheel and rail, in numbers of the test set.
+    """A contact of wheel and rail, by the variables of the test set.
 
-    `along` is the coordinate ξ on the axle, `angle` the angle ψ around it, `radius` the
-    radius of the wheel there, `slope` the slope of the rail, and `gap` the height of
-    the rail above the wheel.
+    `along` is the coordinate ξ of the contact on the axle, and `angle` its angle ψ
+    around the axle. `radius` is the radius of the wheel at ξ, `slope` the slope of the
+    rail at the contact, and `gap` the height of the rail above the wheel.
     """
 
     along: Array
@@ -145,7 +145,8 @@ def contact(q: Array, side: Array) -> Contact:
     outwards = jnp.cos(angle) * down + jnp.sin(angle) * back
     normal = outwards - taper * axle
     slope = -normal[0] / normal[1]
-    # The circle of the rail has this slope at one place, and the wheel must reach it.
+    # The circle of the rail has this slope at one point. The contact of the wheel must
+    # be at this point.
     sec = jnp.sqrt(1 + slope * slope)
     off = RAIL_RADIUS * (math.sin(CONE_ANGLE) - side * slope / sec)
     rail_x = side * (HALF_GAUGE + off)
@@ -175,7 +176,8 @@ def creep_force(q: Array, v: Array, multiplier: Array, side: Array) -> Array:
         outwards = jnp.cos(angle) * down + jnp.sin(angle) * back
         return q[:3] + at.along * axle + at.radius * outwards
 
-    # The point of the wheel that touches now turns with the axle; β itself is cyclic.
+    # The velocity is computed for the material point of the wheel that touches the
+    # rail, which turns with the axle. No function depends on β itself.
     q = q.at[5].set(0.0)
     yaw = q[3] * sec
     turning = v.at[5].add(SPEED / RADIUS)
@@ -191,7 +193,8 @@ def creep_force(q: Array, v: Array, multiplier: Array, side: Array) -> Array:
     creep_spin = (cd * v[3] - sd * turning[5]) / rolling
 
     load = jnp.abs(multiplier) * sec
-    # `initial_state` calls the force with zero multipliers: there is no area then.
+    # `initial_state` calls the force with zero multipliers, for which the area of
+    # contact is zero.
     safe = jnp.where(load > 0, load, 1.0)
     curvature = 0.5 * math.cos(CONE_ANGLE) / at.radius + 0.5 / RAIL_RADIUS
     elastic = 2 * PI * SHEAR_MODULUS * math.sqrt(HERTZ_G) * curvature
@@ -201,7 +204,8 @@ def creep_force(q: Array, v: Array, multiplier: Array, side: Array) -> Array:
     fraction_across = jnp.tanh(
         stiffness * (KALKER_22 * creep_across + KALKER_23 * area * creep_spin)
     )
-    # Both together may not exceed the friction. The force has a kink there.
+    # The resultant of the two creep forces must not exceed the friction. The force has
+    # a kink where it reaches this limit.
     square = fraction_ahead**2 + fraction_across**2
     push = -FRICTION * load / jnp.sqrt(jnp.maximum(square, 1.0))
     on_wheel = push * (fraction_ahead * ahead + fraction_across * across)
@@ -209,7 +213,7 @@ def creep_force(q: Array, v: Array, multiplier: Array, side: Array) -> Array:
 
 
 def force(t: Array, q: Array, v: Array, multipliers: Array, args: Any) -> Array:
-    """Compute the creep forces, and the yaw spring about the vertical."""
+    """Compute the sum of the creep forces and of the yaw spring about the vertical."""
     creep = jax.vmap(creep_force, (None, None, 0, 0))
     total = jnp.sum(creep(q, v, multipliers, jnp.asarray(SIDES)), axis=0)
     torque = -2 * SPRING_ARM**2 * SPRING_Z * q[3]
@@ -290,7 +294,7 @@ class Wheelset:
             )
             return jax.block_until_ready(sol)
 
-        sol, seconds = integrate(1), math.inf  # compiles, for runs of any length
+        sol, seconds = integrate(1), math.inf  # the compilation, for any length
         for _ in range(repeats):
             begin = time.perf_counter()
             sol = integrate(num_steps)
@@ -299,7 +303,7 @@ class Wheelset:
         return Run(end, float(sol.stats["num_iterations"]) / num_steps, seconds)
 
     def reduced_run(self, tolerance: float, duration: float = DURATION) -> Run:
-        """Integrate the equations solved for the accelerations, by Dopri8."""
+        """Integrate by Dopri8 the equations that are solved for the accelerations."""
         system, kept = self.system, self.gaps
 
         def state(q, v):

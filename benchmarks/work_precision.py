@@ -1,26 +1,28 @@
-"""End error against time: nhjax beside diffrax, heyoka, SciPy and IDA.
+"""Error at the end against time: nhjax, diffrax, heyoka, SciPy and IDA.
 
 The competitors integrate the index-reduced equations, written by hand (see
-`_competitors` and `_heyoka`); SUNDIALS IDA the constrained ones. Every run of a case is
-timed in turn with all the others, so that noise hits all of them, and short ones right
-after a call that is not timed, which fills the caches. Its time is the median of seven;
-in brackets is the ratio of the fastest of seven, which says more on a busy machine.
-Compile times are apart; the preparation of initial states is not timed. Under `vmap` a
-batch of nhjax runs on one core; with `--devices k` it runs also spread over as many
-devices of the CPU (`nhjax devices`), and heyoka on two threads (`heyoka threads`).
-Under `taskset -c 0` all that competes has one core.
+`_competitors` and `_heyoka`). Only SUNDIALS IDA also integrates the equations with the
+constraint. All runs of a case are timed in turn, so that noise affects all of them.
+Before a short run is timed, it is called once without timing, to fill the caches. The
+time of a run is the median of seven. The tables have ratios of these medians, and in
+brackets the ratio of the fastest times, which is more reliable on a busy machine.
+Compile times are separate, and the preparation of initial states is not timed. Under
+`vmap` a batch of nhjax runs on one core. With `--devices k` it is also measured on k
+devices of the CPU (`nhjax devices`). heyoka also runs on two threads (`heyoka threads`)
+if this process may use two cores. Under `taskset -c 0` all programs have one core.
 
-For each accuracy the fastest method of a package counts, in whichever form: diffrax
-under `vmap` or with all members in one state, heyoka member by member, in batches or by
-its function for ensembles. The last columns compare the fastest form of nhjax with the
-fastest of all the others.
+For each accuracy the fastest method of a package counts, in any form: diffrax under
+`vmap` or with all members in one state, heyoka member by member, in batches or by its
+function for ensembles. The last columns compare the fastest form of nhjax with the
+fastest method of all other packages.
 
-Errors are the largest of (q, v) at the end over the members, against the exact solution
-or an extrapolation of order 20 in long double. |Φ| is over the size its terms may have,
-the energy error over the energy, both at the end and the largest over the members.
-Of more than 101 members every so many-th has a reference.
+The error is the largest error of (q, v) at the end over the members. The reference is
+the exact solution, or an extrapolation of order 20 in long double. In ensembles of more
+than 101 members, about 101 members at equal distances have a reference. The tables also
+have |Φ|, relative to the possible size of its terms, and the relative energy error.
+Both are taken at the end, and are the largest over the members.
 
-What was saved of cases that a command does not measure is kept.
+Saved results of cases that a command does not measure are not changed.
 """
 
 import argparse
@@ -47,8 +49,9 @@ from ._report import RESULTS, write
 
 
 REPEATS = 7
-SHORT = 0.02  # seconds of a run that is timed with warm caches
-# The system, t, members, s and the longest ladder of each case of the default command.
+SHORT = 0.02  # Runs of fewer seconds are called once before each timed call.
+# For each case of the default command: the system, t, the number of members, the
+# numbers of stages, and the largest length of a ladder.
 FEW = (4, 6, 8)
 CASES = [
     ("chaotic", 20.0, 1, tuple(range(2, 9)), 9),
@@ -71,7 +74,7 @@ CASES = [
 def measure(
     case: Case, stages: tuple[int, ...], limit: int, options: argparse.Namespace
 ) -> Measured:
-    """All runs of a case, timed in turn."""
+    """Run all methods on a case, and time the runs in turn."""
     runs = [
         *nhjax_runs(case, stages, limit),
         *diffrax_runs(case, limit),
@@ -131,7 +134,7 @@ def main() -> None:
         ]
     if options.smoke:
         cases = [("CVT", 2.0, 1, (4,), 2), ("chaotic", 2.0, 3, (4,), 2)]
-    # The first compilation of a process pays for starting the compiler.
+    # The first compilation of a process also starts the compiler, and is not measured.
     compiled(jnp.sin, (jnp.asarray(0.1),))
     everything = kept(RESULTS / "work_precision.json")
     try:
@@ -140,13 +143,13 @@ def main() -> None:
             measured = measure(case, chosen, limit, options)
             print(measured.section(), flush=True)
             everything[measured.title] = measured
-    finally:  # So that an interrupted run leaves what it measured.
+    finally:  # An interrupted run also saves the cases that it has measured.
         if everything and not options.smoke:
             save(list(everything.values()))
 
 
 def save(cases: list[Measured]) -> None:
-    """The tables and the figure of these cases."""
+    """Save the tables and the figure of these cases."""
     text = "\n\n".join(case.section() for case in cases)
     data = {"cases": [case.data() for case in cases]}
     write("work_precision", "Work and precision", text, data)

@@ -2,8 +2,9 @@
 
 `python docs/gallery.py` runs every system, draws docs/gallery/NAME.png and writes
 docs/gallery.md. Names select the pictures to draw, and `--text` writes only the page.
-The text and the formulas come from the docstrings, the models from the source.
-docs/machines.py lists the machines that have points.
+The page takes text and formulas from the docstrings of the systems, and the code of
+the models from their source. docs/machines.py lists the machines that have a method
+`points`.
 """
 
 import argparse
@@ -43,7 +44,7 @@ MODEL_LINES = 40
 
 
 class Run(NamedTuple):
-    """A system and its motion, as arrays with time first."""
+    """A system and its motion, as arrays whose first axis is time."""
 
     example: Any
     ts: np.ndarray
@@ -88,7 +89,7 @@ def run(example: Any, duration: float, num_steps: int, stages: int = 4) -> Run:
 
 
 class Curve(NamedTuple):
-    """A curve over time in the lower panel; a dashed one is there to compare with."""
+    """A curve over time in the lower panel; a dashed curve is for comparison."""
 
     label: str
     values: np.ndarray
@@ -100,15 +101,15 @@ Lines = list[np.ndarray]
 
 
 class Picture(NamedTuple):
-    """The picture of a system, and a panel of what is interesting about it below.
+    """The picture of a system: an upper panel with paths, a lower panel with curves.
 
-    - `paths(run)`: the lines to draw above, each of shape (times, 2) or (times, 3);
-        `axes` are the names of these coordinates.
+    - `paths(run)`: the lines in the upper panel, each of shape (times, 2) or
+        (times, 3); `axes` are the names of these coordinates.
     - `outline(run, k)`: the lines that show the body at the step k; `shown` is the
         number of steps at which they are drawn.
-    - `curves(run)`: the curves of the panel below, with `units` as its label, and
-        `right_units` as the label of the axis on the right, if there is one.
-    - `above`, `below`: what is seen.
+    - `curves(run)`: the curves of the lower panel; `units` is the label of its left
+        axis, and `right_units` the label of its right axis, if it has one.
+    - `above`, `below`: captions that say what the two panels show.
     """
 
     example: Any
@@ -130,7 +131,7 @@ class Picture(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The name of its class."""
+        """The name of the system's class."""
         return type(self.example).__name__
 
 
@@ -159,7 +160,7 @@ def _drifts(*names: str) -> Callable[[Run], list[Curve]]:
 
 
 def _bar(place: np.ndarray, angle: float, back: float, ahead: float) -> np.ndarray:
-    """A line through a place of the plane at an angle."""
+    """A line at an angle, from `back` behind a place of the plane to `ahead` of it."""
     along = np.array([np.cos(angle), np.sin(angle)])
     return place + np.outer([-back, ahead], along)
 
@@ -212,7 +213,7 @@ def _ellipsoid(example: Any) -> Lines:
 
 
 def _body(curves: Callable[[Any], Lines]) -> Callable[[Run, int], Lines]:
-    """Curves that are fixed in a body, on SE(3) or on SO(3) x R³."""
+    """Draw curves that are fixed in a body on SE(3), SO(3) x R³ or SO(3) x R²."""
 
     def outline(run: Run, k: int) -> Lines:
         if isinstance(run.q, tuple):
@@ -336,10 +337,10 @@ def _set_space(ax: Any, points: np.ndarray, ground: bool) -> None:
         is_long = limits[1] - limits[0] > 0.5 * np.max(high - low)
         axis.set_major_locator(MaxNLocator(3 if is_long else 2))
         axis.pane.set_visible(False)
-    # The third axis is drawn at the right corner; its name stands on it.
+    # matplotlib draws the third axis at the right corner. Its name is at its upper end.
     ax.text(high[0], high[1], high[2], f" {ax.get_zlabel()}", va="bottom")
     ax.set_zlabel("")
-    # A long box would be drawn small, and a high one too large.
+    # Without this zoom, a long box would be drawn too small, and a high box too large.
     size = high - low
     zoom = 0.87 if size[2] == np.max(size) else 1.05
     stretch = max(np.max(size) / np.linalg.norm(size) - 0.7, 0)
@@ -386,7 +387,7 @@ def _draw_curves(ax: Axes, picture: Picture, done: Run) -> None:
 
 
 def save(figure: Figure, name: str) -> None:
-    """Write a picture with 64 colours: lines and letters need few more."""
+    """Write a picture with 64 colours, which are enough for lines and letters."""
     file = io.BytesIO()
     figure.savefig(file, dpi=style()["savefig.dpi"])
     image = Image.open(file).convert("RGB").quantize(64, dither=Image.Dither.NONE)
@@ -468,7 +469,7 @@ def _fall(run_: Run) -> list[Curve]:
 
 
 def _two_stages(run_: Run) -> list[Curve]:
-    """The energy of the two-stage method, whose N-th step ends at the start."""
+    """The energy with two stages, whose motion is back at the start after 12 steps."""
     number = 12
     size = 2 * np.sin(np.pi / number)
     coarse = run(run_.example, 2 * number * size, 2 * number, stages=2)
@@ -592,7 +593,7 @@ def _governor(run_: Run) -> list[Curve]:
 
 
 def _machine(name: str, **changes: Any) -> Picture:
-    """The picture of a machine of docs/machines.py, with its run and upper panel."""
+    """The picture of a machine, with the run and the points of docs/machines.py."""
     (machine,) = (m for m in machines.machines() if m.name == name)
 
     def paths(run_: Run) -> Lines:
@@ -605,7 +606,7 @@ def _machine(name: str, **changes: Any) -> Picture:
         lines = [np.array([points[name][0] for name in machine.rods])]
         return lines + [machines.circle(points, wheel)[0] for wheel in machine.wheels]
 
-    # Points with a letter or a number have no article.
+    # Names that end in a letter or a number get no article.
     names = [x.replace("_", " ") for x in machine.traced]
     names = [x if re.search(r"\b[A-Z0-9]$", x) else f"the {x}" for x in names]
     traced = f"path{'s' * (len(names) > 1)} of {' and '.join(names)}"
@@ -650,8 +651,8 @@ def _papers_experiments() -> list[Picture]:
             "the first two coordinates",
             _distance_to_neighbour(1),
             "distance",
-            "a second motion starts 1e-8 away; the distance grows exponentially, as in "
-            "chaos",
+            "a second motion starts 1e-8 away; the distance between the two motions "
+            "grows exponentially, as is typical of chaos",
             axes=("q₁", "q₂"),
             log=True,
         ),
@@ -705,8 +706,8 @@ def _textbook_systems() -> list[Picture]:
             "the slope, with the path of the edge and the edge at some times",
             _knife_edge,
             "position [m]",
-            "the edge does not slide down the slope: it drifts across it, at the mean "
-            "speed G/2θ̇",
+            "the edge does not slide down the slope, but drifts across the slope at "
+            "the mean speed G/2θ̇",
             lambda run_, k: [line[:, ::-1] for line in _headed(0.3)(run_, k)],
             21,
             axes=("y, across the slope [m]", "x, downhill [m]"),
@@ -719,7 +720,7 @@ def _textbook_systems() -> list[Picture]:
             "the path of the blade, and the line from the blade to the centre of mass",
             _speed_and_turning,
             "u, θ̇",
-            "the sleigh slides backwards at first; it turns around and tends to "
+            "the sleigh slides backwards at first; then it turns around and tends to "
             "straight motion, although energy is conserved",
             _headed(0.3, back=0.0),
             13,
@@ -755,7 +756,8 @@ def _textbook_systems() -> list[Picture]:
             "ground",
             _multipliers("λ along the heading", "λ to the left"),
             "force of the ground [N]",
-            "along the axes of the body, the same force is constant",
+            "the components of the centripetal force along the axes of the body are "
+            "constant",
             lambda run_, k: [_bar(run_.q[0][k, :2], run_.q[0][k, 2], 0.5, 0.5)],
             9,
         ),
@@ -796,8 +798,8 @@ def _textbook_systems() -> list[Picture]:
             "the path of the end, and the rods at some times",
             _distance_of_pendula,
             "distance [m]",
-            "a second pendulum starts 1e-8 rad away; the distance grows exponentially, "
-            "as in chaos",
+            "a second pendulum starts 1e-8 rad away; the distance between the two "
+            "pendula grows exponentially, as is typical of chaos",
             lambda run_, k: [np.concatenate([np.zeros(2), run_.q[k]]).reshape(3, 2)],
             4,
             log=True,
@@ -817,8 +819,8 @@ def _rigid_bodies() -> list[Picture]:
             "the angular velocity in body axes",
             _velocities(0, 1, 2, labels=omega),
             "ω [1/s]",
-            "the body spins about its middle axis, which is unstable: it flips over "
-            "again and again",
+            "the body spins about the principal axis of the middle moment of inertia; "
+            "this rotation is unstable, so that the body flips over again and again",
             axes=omega,
         ),
         Picture(
@@ -836,7 +838,7 @@ def _rigid_bodies() -> list[Picture]:
             s.HeavyTopSE3(),
             *(12, 2400),
             _third_axis,
-            f"{tip}, as of `HeavyTop`",
+            f"{tip}, as for `HeavyTop`",
             _multipliers("x", "y", "z"),
             "force of the pivot [N]",
             "the multiplier is the force that holds the pivot",
@@ -849,7 +851,7 @@ def _rigid_bodies() -> list[Picture]:
             tip,
             _velocities(0, 1, labels=omega[:2]),
             "ω [1/s]",
-            "the rotation reverses and tends to a steady one, although energy is "
+            "the rotation reverses and tends to a steady rotation, although energy is "
             "conserved",
             _axis_from_origin,
         ),
@@ -911,7 +913,8 @@ def _rigid_bodies() -> list[Picture]:
             curves=_disc,
             units="tilt [degrees]",
             right_units="ω₃ [1/s]",
-            below="the disc nods, and its rolling rate varies with the tilt",
+            below="the tilt of the disc oscillates, and its rate ω₃ about the axle "
+            "varies with the tilt",
             outline=_body(lambda disc: [float(disc.radius) * ROUND]),
             ground=True,
             above="the disc at some times, and the paths of the contact and of a point "
@@ -936,7 +939,7 @@ def _machines() -> list[Picture]:
             num_steps=125,
             curves=_lean_and_steer,
             units="angle [degrees]",
-            below="the bicycle steers into the fall, and rights itself without a rider",
+            below="the uncontrolled bicycle steers into the fall, and rights itself",
             ground=True,
             shown=5,
             film="A bicycle that leans, steers and rights itself",
@@ -964,7 +967,7 @@ def _machines() -> list[Picture]:
             units="speed along the board [m/s]",
             right_units="rotor ψ [rad]",
             below="the rotor and the axles swing, and the board accelerates from rest, "
-            "against its heading",
+            "backwards",
         ),
         _machine(
             "RollerRacer",
@@ -998,14 +1001,14 @@ def _machines() -> list[Picture]:
             "AndrewsSqueezer",
             curves=lambda run_: [Curve("K1", run_.v[:, 0] * 30 / np.pi)],
             units="K1 [rev/min]",
-            below="the motor accelerates K1 to ten thousand revolutions a minute",
+            below="the motor accelerates K1 to nearly 11 000 revolutions a minute",
         ),
         _machine(
             "CarAxis",
             curves=_heights,
             units="height [m]",
             below="the right end follows the road and swings on its spring; the left "
-            "end stays at its height",
+            "end stays at nearly the same height",
         ),
         _machine(
             "PendulumChain",
@@ -1072,12 +1075,13 @@ DOTS = {"\u0307": "dot", "\u0308": "ddot"}
 LOWERED = str.maketrans("₀₁₂₃₄₅₆₇₈₉ₙᵢₖ", "0123456789nik")
 RAISED = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁺⁻ᵀⁿ", "0123456789+-Tn")
 FUNCTIONS = ("sin", "cos", "tan", "diag")
-# Words of two and three letters; other such runs of letters are products.
+# English words of two and three letters; other letter groups of this length are
+# products of symbols.
 WORDS = re.compile(
     "in|of|is|it|to|by|at|on|an|as|or|so|if|no|and|the|for|are|its|has|one|two|all|not",
     re.IGNORECASE,
 )
-# Formulas do not end so: in an operator, or in a unit such as `[kg m²]`.
+# A formula does not end in an operator, or in a unit such as `[kg m²]`.
 NO_END = re.compile(r"[\s,.;:=+\-·×/(]$|\s\[[A-Za-z1/² ]+\]$")
 OPENING = re.compile(r"[LℓΦφΓ]\w* = ")
 
@@ -1089,8 +1093,8 @@ class Unreadable(ValueError):
 class _Reader:
     """A reader of formulas as docstrings write them.
 
-    It is a parser by recursive descent. Products are written by spaces or without them,
-    and a bar of a fraction has the whole product before it above it.
+    It is a recursive-descent parser. The factors of a product stand side by side, with
+    or without spaces. The numerator of a fraction is the whole product before its bar.
     """
 
     def __init__(self, text: str):
@@ -1098,11 +1102,11 @@ class _Reader:
         self.at = 0
 
     def looking(self, pattern: str) -> re.Match[str] | None:
-        """Match a pattern at the place where the reader is."""
+        """Match a pattern at the current position."""
         return re.compile(pattern).match(self.text, self.at)
 
     def take(self, pattern: str) -> str | None:
-        """Return what matches a pattern, and go behind it."""
+        """Return the text that matches a pattern, and move behind this text."""
         match = self.looking(pattern)
         if match is None:
             return None
@@ -1164,7 +1168,7 @@ class _Reader:
         return self.symbol()
 
     def inside(self) -> str:
-        """Read a bracket, and return what is in it."""
+        """Read a bracket, and return its content."""
         self.at += 1
         inside = self.formula(r"[)\]]")
         if not self.take(r"[)\]]"):
@@ -1172,7 +1176,7 @@ class _Reader:
         return inside
 
     def applied(self, name: str) -> str:
-        """Read the argument of a function: a bracket, or what follows without a gap."""
+        """Read a function's argument: a bracket, or factors up to the next space."""
         shown = rf"\operatorname{{{name}}}" if name == "diag" else rf"\{name}"
         shown += self.scripts()
         self.take(r"\s+")
@@ -1225,14 +1229,14 @@ class _Reader:
 
 
 def _bare(product: str) -> str:
-    """Leave out brackets around all of what is above or below the bar of a fraction."""
+    """Remove brackets that enclose a whole numerator or denominator."""
     inside = product.removeprefix(r"\left(").removesuffix(r"\right)")
     is_bracket = len(inside) == len(product) - 13 and "\\left" not in inside
     return inside if is_bracket and "," not in inside else product
 
 
 def _product(factors: list[str]) -> str:
-    # The small gap after the argument of a function is for a factor behind it.
+    # The small gap after a function's argument is needed only before another factor.
     return " ".join(factors).removesuffix(r"\,")
 
 
@@ -1279,7 +1283,7 @@ def _pieces(paragraph: str) -> Iterator[tuple[str, str]]:
 
 
 def _block(formula: str) -> str:
-    """The LaTeX of an equation, in lines if it is long."""
+    """The LaTeX of an equation, in several lines if it is long."""
     left, _, right = formula.partition(" = ")
     long = len(formula) > 80
     if long and right.startswith("(") and _depth(right[1:-1]) == 0:
@@ -1315,7 +1319,7 @@ def _split(text: str, pattern: str) -> list[str]:
 
 
 def display(paragraph: str) -> tuple[str, str]:
-    """Typeset a paragraph that begins with an equation; the second is what is left."""
+    """Return the typeset equations at the start of a paragraph, and the other text."""
     rows: list[list[str]] = []
     rest = ""
     for formula, after in _pieces(paragraph):
@@ -1341,7 +1345,7 @@ MATHY = re.compile(rf"(?:{'|'.join(FUNCTIONS)})|(?!.*[A-Za-z]{{3}})[^`*\"]+")
 
 
 def inline(text: str) -> str:
-    """Typeset the equations within a text, those with an equals sign between spaces."""
+    """Typeset the equations within a text, which have an equals sign between spaces."""
     done = ""
     while " = " in text:
         before, after = text.split(" = ", 1)
@@ -1362,14 +1366,14 @@ def inline(text: str) -> str:
             done, text = f"{done}{before} = ", after
             continue
         whole = f"{before[start:]} = {after}"
-        # A space of a formula is not a place for a line break.
+        # Lines must not be broken at the spaces of a formula.
         typeset = latex(formula).replace(" ", "\0")
         done, text = f"{done}{before[:start]}${typeset}$", whole[len(formula) :]
     return done + text
 
 
 def _balanced(text: str) -> str:
-    """Cut a text at a bracket that was opened before it."""
+    """Cut a text before the first closing bracket without an opening bracket."""
     depth = 0
     for k, letter in enumerate(text):
         depth += (letter in "([") - (letter in ")]")
@@ -1379,7 +1383,7 @@ def _balanced(text: str) -> str:
 
 
 def _is_mathematics(word: str, behind: int) -> bool:
-    """Whether a word, with a number of others behind it, is part of a formula."""
+    """Whether a word is part of a formula, if `behind` words of it follow this word."""
     if word in ("a", "A", "I"):
         return behind == 0
     plain = re.sub(r"_[A-Za-z]+", "", word)
@@ -1395,19 +1399,20 @@ INTRODUCTION = """\
 # Gallery
 
 `nhjax.systems` has {count} mechanical systems. Each system has parameters, initial
-data, invariants and its source, and many have an exact solution. For each system this
-page shows what it looks like, its Lagrangian and its constraints, what is interesting
-about its motion, and the code that models it. In the formulas, $L$ is a Lagrangian and
-$\\Phi$ are constraints in coordinates. On Lie groups, $\\ell$ is a Lagrangian and
-$\\varphi$ are constraints in body velocities, and $\\Phi$ are holonomic constraints.
+data, invariants and a reference to its source, and many have an exact solution. For
+each system this page shows a picture, the Lagrangian and the constraints, an
+interesting feature of the motion, and the code of the model. In the formulas, $L$ is a
+Lagrangian and $\\Phi$ are constraints in coordinates. On Lie groups, $\\ell$ is a
+Lagrangian and $\\varphi$ are constraints in body velocities, and $\\Phi$ are holonomic
+constraints.
 
 | group | systems |
 |---|---|
 {table}
 
 [Real machines](machines.md) describes how the machines are tested. [Films](films.md)
-shows how to film them. `python docs/gallery.py` draws the pictures of this page. This
-code draws the path of one system:
+shows how to make films of runs. `python docs/gallery.py` draws the pictures of this
+page. This code draws the path of one system:
 
 ```python
 import jax
@@ -1427,9 +1432,9 @@ sol = nhjax.integrate(
 ax = nhjax.plot.trajectory(sol, (0, 1), names=("x", "y"))
 ```
 
-Parameters are arguments of the class, `ChaplyginSleigh(offset=0.2)`, and gradients
-reach them. In the pictures a dot marks the start. Where a system is drawn at several
-times, later times are darker.
+Parameters are arguments of the class, as in `ChaplyginSleigh(offset=0.2)`, and JAX can
+differentiate with respect to them. In the pictures a dot marks the start of a path. If
+a system is drawn at several times, later times are darker.
 """
 
 
@@ -1450,7 +1455,7 @@ def _section(picture: Picture) -> str:
     name = picture.name
     paragraphs, source = described(picture.example)
     last = max((k for k, x in enumerate(paragraphs) if x.startswith("$$")), default=0)
-    # A few words that end a formula stay with it.
+    # A short text after the last formula stays with this formula.
     if re.match(r"[a-z].{,60}$", "".join(paragraphs[last + 1 : last + 2])):
         last += 1
     below = picture.below[0].upper() + picture.below[1:]
@@ -1477,7 +1482,7 @@ def _filled(text: str) -> str:
 
 
 def described(example: Any) -> tuple[list[str], str]:
-    """The paragraphs of a docstring before the parameters, typeset, and the source."""
+    """The typeset paragraphs of a docstring before the parameters, and its source."""
     text = inspect.getdoc(type(example)) or ""
     before, _, after = text.partition("**Parameters:**")
     source = next(x for x in after.split("\n\n") if x.startswith("**Source:**"))
@@ -1509,7 +1514,7 @@ def _model(example: Any) -> str:
 
 
 def model(example: Any) -> list[str]:
-    """The functions of a system and those that they call, from the source."""
+    """The source code of a system's functions, and of the functions that they call."""
     kind = type(example)
     system = example.system
     used = [
@@ -1538,7 +1543,7 @@ def model(example: Any) -> list[str]:
 
 
 def _member(kind: type, name: str) -> Any:
-    """A method or property of a class, as a function, unless it is for all examples."""
+    """A method or property of a class, as a function, or None if `_base` defines it."""
     member = inspect.getattr_static(kind, name, None)
     member = member.fget if isinstance(member, property) else member
     is_own = inspect.isfunction(member) and not member.__module__.endswith("._base")

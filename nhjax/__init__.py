@@ -117,8 +117,9 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-# These are imported at their first use, because they would take a quarter of the time
-# of `import nhjax`: modules (None), and names with the packages that contain them.
+# These names are imported at their first use, because importing them at once would
+# take a quarter of the time of `import nhjax`. The value is the package that contains
+# the name, or None if the name is a module.
 _LOADED_LATER = {
     **dict.fromkeys(("forces", "friction", "plot", "rolling", "systems")),
     **dict.fromkeys(("Looks", "render", "view"), "._films"),
@@ -134,7 +135,7 @@ def __getattr__(name: str) -> Any:
     room = _LOADED_LATER[name]
     if room is None:
         return import_module(f".{name}", __name__)
-    # The next access finds the name without this function.
+    # The name is now a global, so that the next access does not call this function.
     value = globals()[name] = getattr(import_module(room, __name__), name)
     return value
 

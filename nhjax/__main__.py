@@ -161,7 +161,7 @@ def _number(text: str) -> float:
     return value / divisor
 
 
-# argparse shows this name of the type in its error messages.
+# argparse shows the name of the conversion function in its error messages.
 _number.__name__ = "number"
 
 _OPTIONS: dict[str, dict[str, Any]] = {

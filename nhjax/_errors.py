@@ -33,7 +33,7 @@ class NonFiniteError(ValueError):
 
 
 class ConstraintViolationError(ValueError):
-    """Raised if an initial state violates the constraints or is not on its group."""
+    """Raised if an initial state violates constraints, or its q is not on the group."""
 
 
 class IrregularLagrangianError(ValueError):
@@ -47,22 +47,23 @@ class IrregularLagrangianError(ValueError):
 class DependentConstraintsError(ValueError):
     """Raised if the constraints are dependent, that is, D2Φ does not have full rank.
 
-    This is the paper's admissibility condition; with holonomic constraints the rows of
-    DΓ count too.
+    Full rank is the paper's admissibility condition. With holonomic constraints Γ, the
+    rows of D2Φ and of DΓ together must be independent.
     """
 
 
 class IncompatibleConstraintsError(ValueError):
     """Raised if C = D2Φ M⁻¹ D2Φᵀ is singular, so that no multiplier is determined.
 
-    This is the paper's compatibility condition.
+    An invertible C is the paper's compatibility condition.
     """
 
 
 class NewtonError(RuntimeError):
-    """Raised if `initial_state` could not solve an equation by Newton's method.
+    """Raised if `initial_state` or `steady_motion` could not solve its equations.
 
-    The equation is the Legendre transform or the projection onto the constraints.
+    In `initial_state`, Newton's method failed for the Legendre transform or for the
+    projection onto the constraints. In `steady_motion`, it found no steady motion.
     """
 
 
@@ -107,8 +108,8 @@ _ADVICE = (
         jax.errors.NonConcreteBooleanIndexError,
         "write `jnp.where(condition, a, 0.0)` in place of `a[condition]`.",
     ),
-    # The functions of `math` need a number: for traced values they raise the second
-    # error here.
+    # The functions of `numpy` need an array, and raise the first of these errors for
+    # traced values. The functions of `math` need a number, and raise the second one.
     (
         (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError),
         "use functions of `jax.numpy` in place of `numpy` and `math`, and leave out "
@@ -155,7 +156,7 @@ class Check(NamedTuple):
     """A condition, and the exception to raise if it fails.
 
     `error(*values)` creates the exception from NumPy arrays, also in a compiled
-    program. Define it at the top level of a module: if each check created a new
+    program. Define `error` at the top level of a module: if each check created a new
     function, an eager `vmap` would compile again at each call.
     """
 
@@ -204,7 +205,7 @@ def _undecided(checks: tuple[Check, ...]) -> list[Check]:
 
 
 def on_host(values: T) -> T:
-    """Return a tree with NumPy arrays, so that comparisons do not compile.
+    """Return a tree with NumPy arrays, so that comparing them compiles no program.
 
     A tree with traced arrays is returned unchanged.
     """
@@ -242,16 +243,16 @@ def raise_where(
 ) -> T:
     """Return `tree`; where `bad` holds, raise when the compiled program runs.
 
-    The exception is `error(bad, values)`, called with NumPy arrays on the host; under
-    `vmap` all of them have the batch as leading axes. A message with numbers needs a
-    call-back, and this call-back receives all members of a batch.
+    The exception is `error(bad, values)`, called with NumPy arrays on the host. Under
+    `vmap` all these arrays have the batch as leading axes: a message with numbers needs
+    a call-back, and this call-back receives all members of a batch.
     """
-    # The same array often belongs to several checks.
+    # The same array often belongs to several checks, and is passed only once.
     leaves, treedef = jax.tree.flatten(values)
     arrays = list({id(x): x for x in leaves if eqx.is_array(x)}.values())
     place = {id(x): i for i, x in enumerate(arrays)}
     places = [place.get(id(leaf)) for leaf in leaves]
-    # The call-back outlives the trace, and must not hold its arrays.
+    # The call-back outlives the trace, and must not refer to traced arrays.
     dtypes = [x.dtype for x in arrays]
 
     def on_host(bad, *bits):

@@ -29,11 +29,12 @@ from ._results import result_codes, RESULTS
 from ._system import State
 
 
-# Increase this when earlier releases cannot read the files that are written.
+# The version of the file format. Increase it if files change so that earlier releases
+# cannot read them.
 _VERSION = 1
 _HEADER = "nhjax"
 
-# The suffixes of other formats, and the functions that write them.
+# The suffixes of formats that `save` does not write, and the functions that do.
 _XARRAY = "`sol.to_xarray()` and the methods of its result"
 _OTHER_FORMATS = {
     **dict.fromkeys((".nc", ".nc4", ".h5", ".hdf5", ".zarr"), _XARRAY),
@@ -138,7 +139,7 @@ def load(path: str | os.PathLike[str]) -> Any:
     **Raises:** `FileNotFoundError` if the file does not exist, `IsADirectoryError` if
     it is a folder; `ValueError` if `save` has not written it, if it is damaged, or if a
     later release has written it in a format that this release does not know;
-    `DTypeError` if it holds float64 and JAX would round it to float32.
+    `DTypeError` if the file has float64 arrays and JAX would round them to float32.
 
     !!! example
 
@@ -201,7 +202,7 @@ def installed_version() -> str:
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Read all entries; the checksums of the .npz file detect damaged entries."""
-    # A file that NumPy opens itself stays open if it is damaged.
+    # Open the file here: NumPy does not close a damaged file that it has opened itself.
     with open(path, "rb") as opened:
         # For files of other formats, NumPy would recommend to load pickled objects.
         if not zipfile.is_zipfile(opened):

@@ -15,7 +15,7 @@ JUMPS = (
     "the jump, however small: smooth them, as in `jnp.tanh(v / 0.01)`, or split the "
     "run at the jump with an `nhjax.Event`."
 )
-# Advice only for stage solvers that do not switch to Newton's method themselves.
+# This advice is given only if the stage solver does not switch to Newton's method.
 FALLBACK = (
     ', or `stage_solver=nhjax.SimplifiedNewton(jacobian="full")` where feedback, '
     "springs or reactions are stiff, or "
@@ -60,7 +60,7 @@ class RESULTS(eqx.Enumeration, metaclass=_Named):
     the same text. `sol.failures()` has the message of each failed run.
     """
 
-    # With this, a result is printed as `nhjax.RESULTS<...>`.
+    # This assignment makes a result print as `nhjax.RESULTS<...>`.
     __module__ = "nhjax"
 
     successful = ""

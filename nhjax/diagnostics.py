@@ -32,8 +32,8 @@ def energy_error(
     **Arguments:**
 
     - `system`: the system that was integrated.
-    - `sol`: a `Solution` with states, starting with the initial one, for instance saved
-        by `SaveAt(t0=True, steps=True)`.
+    - `sol`: a `Solution` whose first saved state is the initial state, for instance
+        saved by `SaveAt(t0=True, steps=True)`.
     - `args`: the `args` of the integration.
 
     **Returns:** an array of the shape of `sol.ts`.

@@ -1,8 +1,8 @@
 """Forces and torques on points and bodies, as generalised forces of a system.
 
-A force f that acts on a point x(t, q) has the power f · ẋ. Its generalised force is
-F = (∂x/∂q)ᵀ f, on a group F = L_g^* (∂x/∂g)ᵀ f, so that F · v = f · ẋ if the point does
-not depend explicitly on time.
+A force f that acts on a point x(t, q) has the power f · ẋ. The generalised force is
+F = (∂x/∂q)ᵀ f on a vector space, and F = L_g^* (∂x/∂g)ᵀ f on a group. Then
+F · v = f · ẋ if x does not depend explicitly on time.
 """
 
 import abc
@@ -99,9 +99,9 @@ def position_function(value: Any) -> Any:
 
 
 def of_phase(name: str, value: Any, like: Array, *arguments: Any) -> Array:
-    """Evaluate a number, an array or a user's function, of the shape of `like`.
+    """Return a number, an array or the value of a function, in the shape of `like`.
 
-    The function takes (t, q, v, args) or (t, q, v, multipliers, args).
+    The user's function takes (t, q, v, args) or (t, q, v, multipliers, args).
     """
     if callable(value):
         names = ["t", "q", "v", "args"]
@@ -147,8 +147,8 @@ class AbstractForce(AbstractSummable):
     or arrays are leaves: new values do not recompile, and derivatives with respect to
     them are available. A new function recompiles.
 
-    A `HamiltonianSystem` passes momenta in place of velocities: use `Drag`, `Motor` and
-    a `Spring` with a damper only in a `LagrangianSystem`.
+    A `HamiltonianSystem` passes momenta, not velocities, to its forces. Therefore use
+    `Drag`, `Motor` and a `Spring` with a damper only in a `LagrangianSystem`.
 
     To define a force, write a subclass with this method:
 
@@ -240,8 +240,8 @@ class Sum(AbstractSummable):
     ) -> Float[Array, " n"]:
         """Compute the sum.
 
-        The rest of the arguments are the multipliers, if a term takes them, and `args`,
-        by default None.
+        `rest` is (multipliers, args) if a term depends on the multipliers, and (args,)
+        otherwise; without `rest`, `args` is None.
         """
         rest = rest or (None,)
         total = jnp.zeros_like(v)
@@ -377,11 +377,13 @@ class Spring(_AbstractPulledBack):
     """A spring with a damper between two points.
 
     The force on the first point is -(k (|d| - l) + c d/dt |d|) d / |d| with
-    d = x₁ - x₂, and the second point feels the opposite force. Where the points
-    coincide, the force is zero. With l > 0 it jumps there, so keep the points apart.
+    d = x₁ - x₂, and the opposite force acts on the second point. Where the points
+    coincide, the force is zero. With l > 0 the force jumps there: make sure that the
+    points stay apart.
 
-    `system.energy` does not include the energy of a spring. To include it, use no
-    damper and add -½ k (|d| - l)² to the Lagrangian instead. The steps are the same.
+    `system.energy` does not include the energy of a `Spring`. To include it, add
+    -½ k (|d| - l)² to the Lagrangian instead of using a `Spring`; this is possible only
+    without a damper. The computed steps are the same.
 
     **Arguments:**
 
@@ -446,8 +448,8 @@ class Drag(_AbstractPulledBack):
     c₂ = ½ ρ C A with the drag coefficient C. If the point is an angle, f is a torque,
     such as the viscous friction of a bearing.
 
-    The quadratic part has a kink where a motion along a line turns back; methods have
-    order 2 there.
+    The quadratic part has a kink at u = 0. If a point that moves along a line turns
+    back in a step, that step has order 2 only.
 
     **Arguments:**
 
@@ -494,9 +496,9 @@ class Drag(_AbstractPulledBack):
 class Motor(_AbstractPulledBack):
     """A geared motor whose torque falls linearly with its speed.
 
-    It turns the angle φ with the torque i τ₀ (c - i φ̇ / ω₀): a DC motor whose voltage
-    is the fraction c of its full voltage, behind a gear of ratio i. The inertia J of
-    its rotor is a part of the Lagrangian, as ½ J (i φ̇)².
+    The torque on the angle φ is i τ₀ (c - i φ̇ / ω₀). This is a DC motor with the
+    fraction c of its full voltage, which drives the angle through a gear of ratio i.
+    Add the inertia J of its rotor to the Lagrangian, as ½ J (i φ̇)².
 
     **Arguments:**
 
@@ -591,8 +593,9 @@ def _angle(angle: Any, t: Any, q: Any, args: Any) -> Array:
 def saturated(x: ArrayLike, limit: ArrayLike) -> Array:
     """Limit a signal smoothly: limit · tanh(x / limit).
 
-    Each step uses derivatives of the force. `jnp.clip` has a kink at the limit, which
-    costs iterations and lowers the order of the method there.
+    Use this function instead of `jnp.clip` in forces, because each step uses their
+    derivatives. `jnp.clip` has a kink at the limit: steps across the kink need more
+    iterations, and have a lower order.
 
     **Arguments:**
 

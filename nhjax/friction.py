@@ -79,8 +79,8 @@ class Coulomb(AbstractFrictionLaw):
     **Arguments:**
 
     - `friction`: μ, the coefficient of friction.
-    - `smoothing`: u₀ [m/s]. At 3 u₀ the friction is 99.5 percent of μ; at 20 u₀ it is μ
-        to round-off.
+    - `smoothing`: u₀ [m/s]. At 3 u₀ the friction is 99.5 percent of μ; at 20 u₀ it
+        equals μ up to round-off.
 
     !!! example
 
@@ -201,8 +201,9 @@ def _require_velocities(force: Any, system: Any) -> None:
 class _AbstractOnContact(AbstractForceOfReactions):
     """A force -|N| f(r) r at a contact with the normal force N.
 
-    r is a velocity of the contact that depends on v linearly, and f > 0. The
-    generalised force is (∂r/∂v)ᵀ times this force, so that the power is -|N| f(r) r².
+    r is a velocity, or an angular velocity, of the contact that is linear in v, and
+    f > 0. The generalised force is (∂r/∂v)ᵀ times this force, so that its power is
+    -|N| f(r) r².
     """
 
     contacts: eqx.AbstractVar[Contacts]
@@ -218,7 +219,7 @@ class _AbstractOnContact(AbstractForceOfReactions):
 
     @abc.abstractmethod
     def _slope(self, at: ContactState, rate: Array) -> Array:
-        """Return f(r), the force for unit load divided by r."""
+        """Return f(r), the magnitude of the force divided by |N| and by |r|."""
 
     def check_system(self, system: Any) -> None:
         """Raise a `ValueError` unless the contact and its load fit the system."""
@@ -252,8 +253,8 @@ class Sliding(_AbstractOnContact):
     """Friction of a contact that slides, in the directions that slip.
 
     The force on the body is -|N| μ(u) in the direction of the velocity u at which the
-    contact slides. u is the part of the velocity that the constraints of the contact
-    leave free: the whole velocity if `no_slip=()`, and the part along a blade.
+    contact slides. u is the part of the contact's velocity that its constraints leave
+    free: the whole velocity if `no_slip=()`, or the velocity along the edge of a blade.
 
     **Arguments:**
 
@@ -304,15 +305,17 @@ class Sliding(_AbstractOnContact):
 class Tyre(_AbstractOnContact):
     """A tyre that slips a little: its force depends on the slip σ.
 
-    σ = u / (V² + V₀²)^½ with the velocity u at which the contact slides and the speed V
-    of the hub. The force on the wheel is -|N| μ(|σ|) σ / |σ|. Slip along and across the
-    wheel are treated alike, so that their forces share the friction.
+    The slip is σ = u / (V² + V₀²)^½, with the velocity u at which the contact slides
+    and the speed V of the hub. The force on the wheel is -|N| μ(|σ|) σ / |σ|. The
+    vector σ has the slips along and across the wheel, so that the longitudinal and the
+    lateral force share the friction μ(|σ|).
 
     **Arguments:**
 
     - `contacts`, `contact`: the contacts of the system, and the name of one of them.
     - `law`: μ(σ), a `LinearSlip` or a `MagicFormula`.
-    - `slowest`: V₀ [m/s]. Slip is not defined at rest: below V₀ the tyre is a damper.
+    - `slowest`: V₀ [m/s]. The ratio u / V is not defined at rest. Below V₀ the tyre
+        therefore acts like a damper.
     - `load`: as for `Sliding`.
 
     **Raises:** as `Sliding`.
@@ -354,9 +357,10 @@ class Tyre(_AbstractOnContact):
 class RollingResistance(_AbstractOnContact):
     """Rolling resistance: a torque against the rolling of a wheel or a ball.
 
-    The torque is -|N| e tanh(|ω| / ω₀) in the direction of ω, the angular velocity of
-    the body along the plane. This law does not describe the friction of a contact that
-    runs along the rim of a spinning coin: write such a friction as your own force.
+    The torque is -|N| e tanh(|ω| / ω₀) in the direction of ω, the component of the
+    body's angular velocity parallel to the plane. This law does not describe the
+    friction of a contact that runs along the rim of a spinning coin: write such a
+    friction as your own force.
 
     **Arguments:**
 
@@ -400,8 +404,8 @@ class RollingResistance(_AbstractOnContact):
 class PivotingFriction(_AbstractOnContact):
     """Friction against spinning about the normal of the plane.
 
-    The torque about the normal n is -|N| e tanh(ω · n / ω₀). A contact area of radius a
-    with an even pressure has e = 2/3 μ a.
+    The torque about the normal n is -|N| e tanh(ω · n / ω₀). For a circular contact
+    area of radius a with uniform pressure, e = 2/3 μ a.
 
     **Arguments:** as for `RollingResistance`, with the angular velocity about the
     normal in place of the angular velocity along the plane.
@@ -438,7 +442,7 @@ class PivotingFriction(_AbstractOnContact):
 
 
 class JointFriction(AbstractForceOfReactions):
-    """Friction in a joint, from the force that the joint carries.
+    """Friction in a joint, proportional to the load of the joint.
 
     A joint that slides along x has the force -|N| μ(ẋ). A bearing of radius r has the
     torque -r |N| μ(r φ̇) on its angle φ.

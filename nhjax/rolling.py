@@ -8,9 +8,9 @@ are the components along the ground of the velocity
     u = ẋ + Ṙ Rᵀ (c - x) - w
 
 of this point of the body relative to the ground, which moves with the velocity w. Each
-multiplier is the force in newtons in the direction of its constraint. A body may also
-be kept from spinning about the normal of the ground; the multiplier of this constraint
-is a torque in N m.
+multiplier is the force in newtons in the direction of its constraint. An optional
+constraint prevents the body from spinning about the normal of the ground; its
+multiplier is a torque in N m.
 """
 
 import abc
@@ -98,7 +98,7 @@ def _unit(vector: Array) -> Array:
 
 
 class Touch(NamedTuple):
-    """Where a body is nearest to the ground.
+    """The place where a body is nearest to the ground.
 
     - `point`: the point c of the body.
     - `normal`: the unit normal of the ground there, which points away from it.
@@ -194,7 +194,8 @@ class Surface(AbstractGround):
     **Arguments:**
 
     - `elevation`: f, called as `elevation(x, args)` with x of shape (2,) [m]; returns a
-        scalar [m]. It must be smooth. `Heightfield` makes one from numbers on a grid.
+        scalar [m]. f must be smooth. `Heightfield` is such a function, from heights on
+        a grid.
     - `velocity`: as for `Plane`.
 
     !!! example
@@ -252,8 +253,8 @@ class Heightfield(eqx.Module):
     """The elevation of a `Surface` through given heights on a rectangular grid.
 
     The surface is a cubic spline, which has continuous curvature. Outside of the grid
-    the polynomials at its border continue. Orders of methods above 3 are not reached
-    where a contact crosses a line of the grid.
+    the polynomials at its border continue. The third derivatives jump at the lines of
+    the grid: where a contact crosses a line, no method has an order above 3.
 
     **Arguments:**
 
@@ -349,10 +350,10 @@ class AbstractContact(eqx.Module):
 
     To define a shape, write a subclass with the fields below and two methods:
 
-    - `offset(rotation, normal, args)`: the vector from the origin of the body to its
-        point that is farthest in the direction -normal, in space.
-    - `axes(rotation, normal)`: two directions along the ground that are perpendicular
-        to each other, `along` and `across`, of shape (2, 3).
+    - `offset(rotation, normal, args)`: the vector in space from the origin of the body
+        to its point that is farthest in the direction -normal.
+    - `axes(rotation, normal)`: `along` and `across`, two unit vectors along the ground
+        that are perpendicular to each other, of shape (2, 3).
     """
 
     pose: eqx.AbstractVar[PositionFunction]
@@ -513,7 +514,7 @@ def _direction(name: str | float) -> tuple[float, float, float]:
 
 
 class Wheel(AbstractContact):
-    """A wheel, a disc with a thin rim or a tyre that is a torus.
+    """A wheel: a disc with a thin rim, or a tyre in the shape of a torus.
 
     The direction `along` = axle x n, normalised, is the rolling direction, and `across`
     = n x `along`.
@@ -527,23 +528,23 @@ class Wheel(AbstractContact):
     - `pose`: called as `pose(t, q, args)`; returns the position of the hub [m], of
         shape (3,), and the rotation from the frame of the wheel to space, of shape
         (3, 3). The turn of the wheel about its axle is a part of the rotation.
-    - `radius`: from the axle to the thin rim, or to the middle of the tube [m]. It is a
-        number, or a function of `args` that returns it.
-    - `tube_radius`: the radius of the tube of a torus [m], in the same way.
+    - `radius`: the distance from the axle to the thin rim, or to the middle of the tube
+        [m]. It is a number, or a function of `args` that returns a number.
+    - `tube_radius`: the radius of the tube of a torus [m], given like `radius`.
     - `axle`: the direction of the axle in the frame of the wheel.
     - `no_slip`: the directions in which the wheel does not slip: `"along"`, `"across"`,
         or an angle [rad] from `along` towards `across`; with `"spin"` it does not turn
         about the normal of the ground either. An omni wheel has
-        `("along",)`, a mecanum wheel the angle of the axle of its rollers, π/4 or -π/4,
-        and a wheel that slides `()`. If two wheels share an axle, only one of them
-        needs `"across"`.
+        `("along",)`. A mecanum wheel has the angle of the axles of its rollers, π/4 or
+        -π/4. A wheel that slides has `()`. If two wheels share an axle, only one of
+        them needs `"across"`.
     - `touches`: whether the height of the contact is a constraint. Pass False if the
         coordinates fix the height, as the coordinates (x, y, heading) of a robot do.
     - `ground`: a `Plane` or a `Surface`; by default the plane z = 0.
     - `manifold`: the manifold of the system, if it has one.
 
-    **Raises:** `ValueError` if `no_slip` has another name, or directions that follow
-    from each other; when called, `ShapeError` if the pose has other shapes.
+    **Raises:** `ValueError` if `no_slip` has another name, or linearly dependent
+    directions; when called, `ShapeError` if the pose has other shapes.
 
     !!! example
 
@@ -579,7 +580,7 @@ class Wheel(AbstractContact):
         axle = self._axle(rotation)
         radius = _length_in(args, "radius", self.radius, axle.dtype)
         tube = _length_in(args, "tube_radius", self.tube_radius, axle.dtype)
-        # In this form a disc that lies nearly flat loses no digits.
+        # This formula has no cancellation for a disc that lies nearly flat.
         along, _ = self.axes(rotation, normal)
         down = cross_matrix(axle) @ along
         return radius * down - tube * normal
@@ -669,7 +670,8 @@ class Blade(AbstractContact):
 
     - `pose`: called as `pose(t, q, args)`; returns the position of the point that
         touches [m], of shape (3,), and the rotation of the blade, of shape (3, 3).
-    - `lateral`: the direction in the frame of the blade in which it does not move.
+    - `lateral`: the direction in which the blade does not move, in the frame of the
+        blade.
     - `no_slip`, `touches`, `ground`, `manifold`: as for `Wheel`.
 
     **Raises:** when called, `ShapeError` if the pose has other shapes.
@@ -737,7 +739,7 @@ class Contacts(eqx.Module):
         Array([0.  , 0.  , 9.81], dtype=float64)
     """
 
-    # JAX sorts the keys of a dictionary, so that the order would not be kept.
+    # The contacts are not stored in a dictionary, because JAX would sort its keys.
     names: tuple[str, ...] = eqx.field(static=True)
     contacts: tuple[AbstractContact, ...]
     _num_others: int = eqx.field(static=True)
@@ -750,9 +752,9 @@ class Contacts(eqx.Module):
         self._num_others = 0
 
     def followed_by(self, num_others: int) -> "Contacts":
-        """Return the same contacts, for a system with other holonomic constraints.
+        """Return the same contacts, for a system with additional holonomic constraints.
 
-        `num_others` is the number of these constraints. They must come after the
+        `num_others` is the number of additional constraints. They must come after the
         heights, so that their multipliers are the last ones. Pass the result to the
         forces of `nhjax.friction` in such a system.
         """
@@ -791,13 +793,13 @@ class Contacts(eqx.Module):
 
         The forces follow from the multipliers of the state. They have no parts in
         directions that are not constrained. For a contact with `touches=False`, they
-        have no part along the normal, because the coordinates hide it.
+        have no part along the normal, because no multiplier represents this force.
 
         **Arguments:**
 
         - `t`, `y`, `args`: the time, the state and the arguments of the system. The
-            system must have the constraints of these contacts and no others, or
-            others as `followed_by` describes.
+            system must have the constraints of these contacts, and no additional ones
+            except those that `followed_by` describes.
         - `frame`: whether the force is a vector in space, or has the components along,
             across and normal of the frame of the contact.
 
@@ -972,12 +974,12 @@ def margin(
     *,
     load: ArrayLike | ForceFunction | None = None,
 ) -> Callable[[Any, State, Any], FloatScalar]:
-    """Return a function that says how much more friction a contact could bear.
+    """Return a function for the reserve of friction of a contact.
 
     It is the function (t, y, args) -> μ |N| - |F_t| [N] of the friction coefficient μ,
     the normal force N and the force F_t of the constraints along the ground. The
-    contact rolls where its value is positive. Pass the function to `SaveAt(fn=)`, or
-    see `slips`.
+    contact rolls where its value is positive. Pass the function to `SaveAt(fn=)`. To
+    stop a run where the value becomes zero, use `slips`.
 
     **Arguments:** as for `slips`, without `options`.
 

@@ -45,8 +45,9 @@ class SystemReport(eqx.Module):
     - `dimension`: the number n of coordinates.
     - `num_nonholonomic`, `num_holonomic`: the numbers m and k of constraints.
     - `mass_condition`, `compatibility_condition`: the condition numbers of M = ∂p/∂v
-        and of C = B M⁻¹ Bᵀ, after their rows and columns are scaled to size one. If
-        one is infinite, the accelerations at the state are not determined.
+        and of C = B M⁻¹ Bᵀ, after their rows and columns are scaled to size one; B is
+        the Jacobian of the constraints with respect to v. If one of these numbers is
+        infinite, the accelerations at the state are not determined.
     - `violations`: the values of the constraint functions by name, "Φ[0]" for
         nonholonomic ones and "Γ[0]", "dΓ[0]/dt" for holonomic ones.
     - `dependent`: the names of constraints that depend on each other, if any.
@@ -133,11 +134,11 @@ def check_system(
     - `system`: the mechanical system.
     - `q`: the configuration, as for `initial_state`.
     - `v`, `p`: the velocity of a Lagrangian system, or the momentum of a Hamiltonian
-        one, shape (n,).
+        system, shape (n,).
     - `t`, `args`: passed on to the functions of the system.
 
     **Returns:** a `SystemReport`. The arguments on which functions depend are found
-    from derivatives at three states near the given one.
+    from derivatives at three states near the given state.
 
     **Raises:** the errors of `initial_state` for arguments, and for values returned by
     the system's functions, that have a wrong type or shape or are not finite;
@@ -177,7 +178,8 @@ def check_system(
     rates = letters[:m] + [f"d{name}/dt" for name in letters[m:]]
     values = [*found["constraints"], *found["position_constraints"]]
     changes = {key: _changes(found[key]) for key in (_MASS, _JACOBIAN)}
-    # If a row is not finite, the condition number of C reports it.
+    # A row that is not finite is not reported as dependent: it makes the condition
+    # number of C infinite.
     rows = dependent_rows(found["jacobian"]) if found["deficient"] else []
     moving = np.any(_changes(found["by_position"]), axis=0)
     return SystemReport(
@@ -287,7 +289,8 @@ def _derivatives(system, t, q, u, args, near) -> dict[str, Any]:
 
     by_time, by_position, second = jax.vmap(sample)(*near)
     rows = constraint_rows(t, jnp.zeros_like(u), u)
-    # If a constraint is the square of an expression, its row is zero where it holds.
+    # If a constraint is the square of an expression, its row is zero in states that
+    # satisfy the constraint.
     rows_near = jax.vmap(constraint_rows, (None, 0, 0))(t, *near)
     elsewhere = jnp.max(jnp.abs(rows_near), axis=(0, 2))
     zero = jnp.finfo(u.dtype).eps ** 0.75 * elsewhere

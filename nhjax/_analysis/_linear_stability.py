@@ -78,13 +78,15 @@ def linear_stability(
 
     A steady motion, or relative equilibrium, is an orbit of a one-parameter group of
     symmetries of the system. Let x = (q, u), let ẋ = f(x) be the equations of motion,
-    whose multipliers follow from the hidden constraints, and let X be the vector field
-    that generates the symmetries. Then f - X vanishes at the state, and
+    whose multipliers follow from the time derivatives of the constraints, and let X be
+    the vector field that generates the symmetries. Then f - X vanishes at the state,
+    and
 
     ż = A z,    A = W D(f - X) Z,
 
-    in the frame that moves with X. Perturbations δx = Z z satisfy the constraints to
-    first order, and W Z = 1. On a group they are left-trivialised.
+    in the frame that moves with X. The columns of Z are perturbations δx that satisfy
+    the constraints to first order, and W is a left inverse of Z: W Z = 1. On a group,
+    perturbations are left-trivialised.
 
     There are two ways to specify X. With `symmetry`, X is the combination of the given
     generators along which the state moves. Perturbations along the generators only

@@ -35,7 +35,8 @@ class Orbit(NamedTuple):
 
     - `directions`: the generators at the state, as vectors of perturbations.
     - `jacobians`: their derivatives with respect to perturbations x = (ξ, w).
-    - `motion`, `motion_jacobian`: the same for the equations of motion.
+    - `motion`, `motion_jacobian`: the vector field of the equations of motion at the
+        state, and its derivative.
     - `nearby`: the derivatives of the equations of motion and of the generators, in
         this order, at the state displaced by ± `steps` along each generator.
     """
@@ -146,7 +147,8 @@ def linearise_along_symmetry(system, t, y, args, symmetry) -> LinearisedEquation
     steps = difference_steps(directions, state_size(y))
     moved = jnp.stack([steps, -steps], axis=1)[:, :, None] * directions[:, None, :]
     points = jnp.concatenate([zero[None], moved.reshape(-1, 2 * dim)])
-    # `map` compiles one program for all points: most of the time is compilation.
+    # `map` compiles the function once for all points, which saves time because most of
+    # the time is compilation.
     samples, values = jax.lax.map(at, points)
     number = 2 * dim * (1 + len(directions))
     jacobians = samples[0, :number].reshape(-1, 2 * dim, 2 * dim)

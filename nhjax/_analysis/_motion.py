@@ -83,7 +83,7 @@ def motion(
     """Compute accelerations, multipliers and reaction forces at a state.
 
     The function solves the continuous equations of motion (the paper's section 3)
-    together with the hidden constraints,
+    together with the hidden constraints (the time derivatives of the constraints),
 
     M v̇ - Bᵀ λ = ad*_v p + D1L + F - (∂t + D1 v) p,    B v̇ = -(∂t + D1 v) Φ,
 

@@ -131,8 +131,8 @@ def steady_motion(
     - `symmetry`: generators of symmetries, as `linear_stability` takes them, in place
         of `positions` and `velocities`.
     - `held_positions`, `held_velocities`: the indices of the positions and velocities
-        that keep their values in `y`. On a group a position is held if this component
-        of ξ is zero in q τ(ξ), where q is the configuration of `y`.
+        that keep their values in `y`. On a group, the configuration of the result is
+        q τ(ξ) with the configuration q of `y`, and holding position i means ξ_i = 0.
     - `max_iterations`: the largest number of iterations.
 
     **Returns:** a consistent `State`. With `symmetry`, a pair of the state and the
@@ -187,7 +187,8 @@ def steady_motion(
         )
     check_symmetry(symmetry, y)
     outcome = solve_along_symmetry(system, t, y, args, symmetry, held, max_iterations)
-    # The check uses the compiled program of `linear_stability`, which users call next.
+    # The check uses the compiled program of `linear_stability`. If the user calls this
+    # function next, it need not be compiled again.
     given = stop_gradient((system, t, outcome.state, args))
     conditions = _symmetry_conditions(
         linearise_along_symmetry(*given, symmetry), given[2]
@@ -292,7 +293,7 @@ def solve_along_symmetry(
         ]
         return motion, jnp.concatenate(lifts, axis=1), constraints
 
-    # The rates for which the generators are closest to the velocity.
+    # The rates for which the combination of generators is closest to the velocity.
     here = stop_gradient(
         lift_generators(system, symmetry, t, y.q, system.fibre_coordinate(y), args)
     )

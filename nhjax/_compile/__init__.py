@@ -1,4 +1,4 @@
-"""Functions of nhjax as compiled programs, which are traced again if globals change."""
+"""Compiled functions of nhjax, which are traced again if values they read change."""
 
 from ._kernel import as_cpu_kernel as as_cpu_kernel, TraceCache as TraceCache
 from ._loop_start import started_like as started_like

@@ -19,9 +19,10 @@ T = TypeVar("T")
 class TraceCache:
     """A cache of the traced programs of functions.
 
-    A key contains the function and the kinds of its arguments. A function of the user
-    may also read values that change between two calls of `integrate`. Programs are
-    therefore kept only while one run is traced and differentiated.
+    A key contains the function and the kinds of its arguments, but not other values. A
+    function of the user may read such values, and they may change between two calls of
+    `integrate`. A cache is therefore used only while one run is traced and
+    differentiated.
     """
 
     def __init__(self):
@@ -32,13 +33,13 @@ class TraceCache:
         return self._known.get(key)
 
     def keep(self, key: Hashable, traced: "_Traced") -> None:
-        """Keep a program, unless it contains a tracer of another trace."""
+        """Store a program, unless it contains a tracer of another trace."""
         if not captures_tracers(traced.program):
             self._known[key] = traced
 
 
 class _Traced(NamedTuple):
-    """A traced function: its jaxpr, the structure of its arrays, and other results."""
+    """A traced function: its jaxpr, the tree of its arrays, and its other results."""
 
     program: Any
     structure: Any
@@ -61,9 +62,9 @@ def as_cpu_kernel(
 
     - `function`, `args`: the function, and its arguments: trees of arrays and other
         objects.
-    - `programs`: a cache of traced programs. With it, the function is traced once for
-        each kind of arguments, and must not depend on other values.
-    - `is_brief`: whether the program runs once and for a short time. Then it is
+    - `programs`: a cache of traced programs. With a cache, the function is traced once
+        for each kind of arguments, and must not depend on other values.
+    - `is_brief`: whether the program runs once and for a short time. Such a program is
         compiled in less time, to slower code.
     """
     # With `jax.disable_jit`, the user wants to step through single operations.

@@ -1,10 +1,11 @@
 """An operation that tells the compiler the initial carry of a loop that is continued.
 
-A run is a loop whose carry starts with constants, such as the zeros of a mass matrix.
-The constants that no iteration changes are constants of the whole loop, and the
-compiler leaves out operations with them. If the loop is interrupted and continued from
-arrays, the compiler no longer knows these constants. Without this operation, the
-continued loop would be slower and would round differently.
+A run is a loop, and some numbers in its initial carry are constants, such as the zeros
+of a mass matrix. If no iteration changes such a number, it is a constant of the whole
+loop, and the compiler simplifies operations with it. If the loop is interrupted and
+continued from arrays, the compiler no longer knows these constants. Without this
+operation, the continued loop would be slower than the original loop, and would round
+differently.
 """
 
 from typing import TypeVar
@@ -28,8 +29,8 @@ def started_like(first: T, carry: T) -> T:
     """Return `carry`, the carry of a loop that started from `first` and is continued.
 
     Where a number of `first` is a constant of the program, and the loop does not change
-    this number, the compiler uses the constant. The same loop must have led from
-    `first` to `carry`.
+    this number, the compiler uses the constant. The values in `carry` must come from
+    earlier iterations of the same loop, which started from `first`.
     """
     ours, structure = jax.tree.flatten(carry)
     out = loop_start.bind(*ours, *jax.tree.leaves(first))

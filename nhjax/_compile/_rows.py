@@ -1,7 +1,7 @@
 """Functions that are applied to each row of some arrays, as one operation of a program.
 
-A program that contains a long function once for each stage of a method would grow with
-the number of stages, and so would the time to compile it.
+If a program contained a copy of a long function for each stage of a method, the program
+and the time to compile it would grow with the number of stages.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,7 @@ def vmapped(function: Callable[..., T], *rows: Any, out_axis: int = 0) -> T:
     """Compute `jax.vmap(function)(*rows)`, with a long function as one operation.
 
     Within a program that nhjax's own compiler compiles, the operation is a loop over
-    the rows. Then the time of compilation does not grow with the number of rows. The
+    the rows, so that the time of compilation does not grow with the number of rows. The
     operations that do not depend on the rows are computed once, before the loop.
 
     **Arguments:**

@@ -1,7 +1,7 @@
 """The sum of products of two small arrays, as one operation until it is lowered.
 
-Otherwise a product would be about five operations, and its derivatives would be several
-times as many: tracing a gradient took 15 to 40 percent longer.
+Without this operation, a product would be about five operations, and its derivatives
+several times as many. Tracing a gradient then took 15 to 40 percent longer.
 """
 
 import itertools
@@ -20,7 +20,7 @@ from jaxtyping import Array
 from ..lanes import never_high, SMALL_PRODUCT
 
 
-# Longer sums are not written out term by term.
+# Sums with more terms than this are not written out term by term.
 LONGEST_SUM = 128
 
 
@@ -40,7 +40,8 @@ def _written_out(
     x, y = _aligned(a, first, order), _aligned(b, second, order)
     if not by_terms:
         return jnp.sum(x * y, axis=tuple(range(len(result), len(order))))
-    # A reduction of this size would be a call into a library.
+    # The terms are added one by one, because a reduction of this size would be a call
+    # into a library.
     ranges = (range(a.shape[first.index(index)]) for index in summed)
     return reduce(
         jnp.add, (x[..., *k] * y[..., *k] for k in itertools.product(*ranges))

@@ -1,7 +1,7 @@
 """Compilation that notices changes of globals and closed-over variables.
 
-A function compiled by `jax.jit` keeps the values that globals and closed-over variables
-had when it was traced. `tracked_jit` traces the function again when such a value
+A function compiled by `jax.jit` always uses the values that globals and closed-over
+variables had when it was traced. `tracked_jit` traces the function again when a value
 changes: at each call `captured_by` lists the values that the functions of the user
 read, and the list is a part of the key of the compiled program.
 """
@@ -30,16 +30,18 @@ import numpy as np
 from ..lanes import rare_collections
 
 
-# The place of a value: the identity of its owner, and a name or index.
+# The owner of a value is the object that contains the value. The place of the value is
+# the identity of its owner, and a name or index in the owner.
 Place: TypeAlias = tuple[int, Hashable]
 # The owner of a value, its name in the owner, and the value.
 Part: TypeAlias = tuple[object, Hashable, Any]
 T = TypeVar("T")
 
-# If functions read more values, the others are ignored: comparing them would take
-# longer than a short run.
+# At most this many values are compared. If functions read more values, the other values
+# are ignored, because comparing them would take longer than a short run.
 MOST_ENTRIES = 2000
-# These libraries may be installed from a working copy, outside of the usual folders.
+# These libraries are recognised by their names, because they may be installed from a
+# working copy, outside of the usual folders.
 _LIBRARIES = ("equinox", "jax", "jaxlib", "jaxtyping", "nhjax", "numpy")
 # Since Python 3.12, LOAD_FROM_DICT_OR_GLOBALS reads globals in a class body inside a
 # function.
@@ -86,7 +88,7 @@ def _is_installed(module: str) -> bool:
 class _Identity:
     """An object that is compared by its identity.
 
-    It is kept alive, so that no other object gets the same identity.
+    The object is stored too, so that no other object gets the same identity.
     """
 
     number: int
@@ -94,7 +96,7 @@ class _Identity:
 
 
 class _Unrepeatable:
-    """A value that equals only itself; it stands for a tracer."""
+    """The data by which a tracer is compared: an object that equals only itself."""
 
 
 @lru_cache(maxsize=4096)
@@ -124,7 +126,7 @@ def _atom(value: Any) -> Hashable:
     if not _is_leaf(cls):
         return _Identity(id(value), value)
     if isinstance(value, _ARRAYS):
-        # NumPy's arrays can be changed in place; JAX's cannot.
+        # NumPy's arrays can be changed in place, so their contents are compared.
         digest = hashlib.blake2b(value.tobytes(), digest_size=16).digest()
         return cls, value.dtype, value.shape, digest
     if isinstance(value, _NUMBERS):
@@ -142,7 +144,7 @@ def _key_name(key: Any) -> Hashable:
 
 
 def _parts(value: Any) -> Iterator[Part]:
-    """Yield the values inside a value, each with its owner and its name in it."""
+    """Yield the values inside a value, each after its owner and its name there."""
     if isinstance(value, types.FunctionType):
         yield from _read_by(value)
     elif isinstance(value, _MAPPINGS):
@@ -156,7 +158,7 @@ def _parts(value: Any) -> Iterator[Part]:
             if hasattr(type(value), name):
                 yield value, name, getattr(value, name)
     elif _is_open(type(value)):
-        # The attributes, and the slots after them, without calling code of the class.
+        # Yield the attributes, and then the slots, without calling code of the class.
         state: Any = object.__getstate__(value)
         for variables in state if isinstance(state, tuple) else (state,):
             for name, x in list((variables or {}).items()):
@@ -164,7 +166,7 @@ def _parts(value: Any) -> Iterator[Part]:
                     yield value, name, x
         yield value, "__class__", type(value)
     elif hasattr(value, "__wrapped__"):
-        # The result of `jax.jit` keeps the user's function under this name.
+        # The result of `jax.jit` stores the user's function in this attribute.
         yield value, "__wrapped__", value.__wrapped__
 
 
@@ -187,7 +189,7 @@ def _read_by(function: types.FunctionType) -> Iterator[Part]:
     if not _is_installed(str(known.get("__name__", ""))):
         found += [(known, name, known[name]) for name in variables if name in known]
     modules = set()
-    for part in found:  # The list grows.
+    for part in found:  # The list grows during the loop.
         yield part
         module = part[2]
         if isinstance(module, types.ModuleType) and not _is_installed(module.__name__):
@@ -215,7 +217,7 @@ def _of_class(cls: type) -> Iterator[Part]:
 
 @lru_cache(maxsize=4096)
 def _static_fields(cls: type) -> tuple[str, ...] | None:
-    """Return the names of static fields; `None` for library classes without any."""
+    """Return the names of static fields; `None` if a class of a library has none."""
     fields = getattr(cls, "__dataclass_fields__", {}).values()
     names = tuple(x.name for x in fields if x.metadata.get("static", False))
     return names or (None if _is_installed(cls.__module__) else ())
@@ -223,7 +225,8 @@ def _static_fields(cls: type) -> tuple[str, ...] | None:
 
 def static_parts(tree: Any) -> list[Any]:
     """List the leaves of a tree that are not arrays, and the static fields and the
-    classes of its nodes. Its arrays are arguments of the compiled program.
+    classes of its nodes. The arrays are not listed, because they are arguments of the
+    compiled program.
     """
     nodes: list[Any] = []
 
@@ -247,7 +250,7 @@ class Captured:
       name in the owner. Objects have numbers in the order of the search, so that a new
       function equal to an old one has equal atoms.
     - `contents`: the owner and the content of each place; the content of an object with
-      parts is its identity. The owners are kept alive, so that no other object gets the
+      parts is its identity. The owners are stored, so that no other object gets the
       same identity.
     """
 
@@ -266,7 +269,7 @@ class Captured:
                 continue
             content = atom = _atom(value)
             if isinstance(atom, _Unrepeatable):
-                # A function that stores a tracer stores another one at each tracing.
+                # A function that stores a tracer stores a new tracer at each tracing.
                 content = _Identity(id(value), value)
                 self.is_repeatable = False
             has_objects = isinstance(value, np.ndarray) and value.dtype.hasobject
@@ -283,7 +286,10 @@ class Captured:
 
 @dataclass(frozen=True)
 class _Key:
-    """The values that functions read; `traces` grows when a program is traced."""
+    """The values that functions read, as a key of compiled programs.
+
+    `traces` gets an entry when a program with this key is traced.
+    """
 
     atoms: tuple[Hashable, ...]
     traces: list[None] = field(default_factory=list, compare=False)
@@ -291,8 +297,9 @@ class _Key:
 
 # Values that change during tracing, such as a list in which a function counts its
 # calls, are ignored: otherwise the function would be traced again forever. The owners
-# are kept, so that their identities are not reused. If there are more entries than
-# _MOST, all are dropped, and programs that are still used are traced once more.
+# are stored too, so that their identities are not reused. If there are more entries
+# than _MOST, all entries are removed, and programs that are still used are traced once
+# more.
 _MOST = 1000
 _changed_by_tracing: dict[Place, object] = {}
 # This maps the key after tracing to the key with which the program was traced.
@@ -313,8 +320,8 @@ def tracked_jit(*tracked: str) -> Callable[[Callable[..., T]], Callable[..., T]]
     change.
 
     The result is a decorator. The decorated function is called with positional
-    arguments. It also accepts the keyword argument `captured`, the result of
-    `captured_by` if this is already known.
+    arguments. If the caller already has the result of `captured_by`, it can be passed
+    as the keyword argument `captured`.
 
     **Arguments:**
 

@@ -1,9 +1,9 @@
 """A primitive that writes a row into a buffer, and is one operation until lowering.
 
 A loop that saves its states writes each row of a buffer once. JAX's own update of an
-array does not know this: its derivative in reverse mode sets the row of the cotangent
-to zero, for which XLA copies the whole buffer in each iteration. The time of a gradient
-would grow with the square of the number of rows.
+array cannot assume this: its derivative in reverse mode sets the row of the cotangent
+to zero, for which XLA copies the whole buffer in each iteration. With this update, the
+time of a gradient would grow with the square of the number of rows.
 """
 
 from functools import partial
@@ -30,8 +30,8 @@ def write_row(
 ) -> Shaped[Array, "rows *shape"]:
     """Write a row to the index `slot` of a buffer, where 0 <= slot < length.
 
-    Each row of the buffer may be written only once. Only a row that is never read may
-    be written more often, such as a row for data that are not saved.
+    Each row of the buffer may be written only once. The exception is a row that is
+    never read, such as a row for data that are not saved.
     """
     return _write.bind(buffer, row, slot, axis=0)
 
@@ -61,8 +61,8 @@ def _jvp(primals, tangents, *, axis):
 
 
 def _transpose(cotangent, buffer, row, slot, *, axis):
-    # The row was not written before. Therefore its cotangent in the buffer need not be
-    # set to zero.
+    # No earlier operation has written the row. Therefore its cotangent in the buffer
+    # need not be set to zero.
     of_buffer = cotangent if ad.is_undefined_primal(buffer) else None
     of_row = None
     if ad.is_undefined_primal(row) and not isinstance(cotangent, ad.Zero):

@@ -90,7 +90,7 @@ class Lock:
     def acquire(self, path: Path, what: str) -> None:
         """Lock a file, and create it if it does not exist.
 
-        `what` is the name of its folder in messages.
+        `what` names the folder of the file in messages.
 
         **Raises:** `RuntimeError` if another process has locked the file, or if the
         operating system has no such locks.
@@ -144,8 +144,9 @@ class Journal:
 
     Process 0 appends to the journal. Every other process appends to its own part, which
     it locks while it runs. A run begins and ends with a single journal: process 0 first
-    appends the parts that an interrupted run has left, and finally writes all lines in
-    the order of chunks. `lines` has the lines that this process has written.
+    appends the parts that an interrupted run has left, and at the end writes the lines
+    of all processes in the order of chunks. `lines` has the lines that this process has
+    written.
     """
 
     def __init__(self, folder: Path, index: int):
@@ -161,7 +162,7 @@ class Journal:
             os.truncate(self.path, len(complete))
         for part in sorted(self.folder.glob(_PARTS)):
             lock = Lock()
-            # A process of an interrupted run may outlive the others for a while.
+            # The lock fails if a process of the interrupted run is still running.
             lock.acquire(part, self._where)
             if lines := _complete_lines(part)[0]:
                 append(self.path, lines)

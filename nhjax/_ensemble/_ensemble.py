@@ -23,8 +23,8 @@ from ._sinks import (
 from ._store import CheckpointedReductionSink, ZarrSink
 
 
-# By default a chunk has `_MEMBERS` members for each device, which keep all cores busy.
-# It has fewer members if the values of so many would take more than `_BYTES` bytes.
+# By default a chunk has `_MEMBERS` members for each device, enough to use all cores. It
+# has fewer members if the values of these members would take more than `_BYTES` bytes.
 _MEMBERS, _BYTES = 1024, 2**26
 # Suffixes of file formats. `out` names a folder, and must not end in one of them.
 _FILES = (".nc", ".nc4", ".h5", ".hdf5", ".csv", ".npy", ".npz", ".mat", ".pkl")
@@ -65,8 +65,8 @@ def ensemble(
 
     - `run`: a function of one member that returns a tree of arrays.
     - `members`: a tree of arrays with the members as leading axis, or a function from
-        the index of a member to the member. The function needs no memory for the
-        members, and JAX traces it.
+        the index of a member to the member. JAX traces the function, so that the
+        members need no memory.
     - `num_members`: the number of members, if `members` is a function.
     - `out`: a folder for a Zarr store, to which the values of each chunk are written.
         `xarray.open_zarr` opens the store. If a run is interrupted, the same call
@@ -81,9 +81,10 @@ def ensemble(
         values of a member are large.
     - `devices`: the JAX devices to use, `jax.local_devices()` by default.
     - `fixed_order`: compute statistics in an order that does not depend on the number
-        of devices and processes. If the values of the members are then equal bit for
-        bit, so are the statistics. This takes more time, because each device reduces
-        all members of a chunk, and processes wait for each other after each chunk.
+        of devices and processes. Two runs then have statistics that are equal bit for
+        bit, if the values of their members are. This order takes more time, because
+        each device reduces all members of a chunk, and processes wait for each other
+        after each chunk.
     - `progress_meter`: shows the number of finished members; by default a bar on the
         standard error stream if that is a terminal.
     - `resume`: whether to resume the run of an existing store; if False, an existing
@@ -95,10 +96,10 @@ def ensemble(
 
     **Raises:** `nhjax.ShapeError` for arrays that differ in their leading axis;
     `TypeError` if `run` returns anything except arrays; `ValueError` for invalid
-    numbers, for a store that is damaged or belongs to other arguments, and for
-    processes that call with different arguments; `RuntimeError` for a store that
-    another run is writing, and if another process has failed or has ended; `OSError` if
-    the store cannot be written; `ImportError` with `out` if zarr is missing
+    numbers, for a store that is damaged or belongs to other arguments, and if processes
+    call `ensemble` with different arguments; `RuntimeError` for a store that another
+    run is writing, and if another process has failed or has ended; `OSError` if the
+    store cannot be written; `ImportError` with `out` if zarr is missing
     (`pip install "nhjax[ensemble]"`); `nhjax.IntegrationError` with `reduce` if all
     members failed.
 

@@ -12,8 +12,8 @@ import numpy as np
 from jax.experimental.multihost_utils import process_allgather
 
 
-# Data are padded to vectors of at least this many bytes, in powers of two, so that few
-# programs are compiled for them.
+# Data are padded to vectors whose length is a power of two and at least this number of
+# bytes. JAX compiles a program for each length, so that this saves compilations.
 _MIN_BYTES = 1024
 # The time between two collective operations while processes run separate chunks. On the
 # CPU, a collective operation fails after a process has waited for 30 minutes.
@@ -46,7 +46,7 @@ class Processes:
         except Exception as error:
             if self.count > 1 and not self._has_ended:
                 self._has_ended = True
-                # If the others cannot be reached, raise the original error.
+                # If the other processes cannot be reached, raise the original error.
                 with suppress(RuntimeError):
                     self._gather(True, f"{type(error).__name__}: {error}".encode())
             raise
@@ -97,7 +97,7 @@ class Processes:
             row = np.zeros(size, np.uint8)
             row[: len(data)] = np.frombuffer(data, np.uint8)
             rows = np.asarray(process_allgather(row)) if size else [row] * self.count
-        # JAX raises either of these if a process has ended.
+        # JAX raises either of these errors if a process has ended.
         except (jax.errors.JaxRuntimeError, ValueError) as error:
             self._has_ended = True
             raise RuntimeError(
@@ -125,9 +125,9 @@ def check_equal_devices(owners: list[int]) -> None:
 class PeriodicExchange:
     """Lets processes exchange errors periodically while each runs its own chunks.
 
-    So an error in one process soon ends the other processes, and no process waits long
-    for a slower process. Each exchange decides how many chunks each process runs before
-    the next exchange.
+    An error in one process therefore ends the other processes soon, and no process
+    waits long for a slower process. Each exchange decides how many chunks each process
+    runs before the next exchange.
     """
 
     def __init__(self, processes: Processes, num_chunks: int, is_needed: bool):

@@ -2,8 +2,8 @@
 
 A job is split into chunks of members. One compiled program runs every chunk, spread
 over the devices, and reports which members failed. The manifest and the text of the
-program identify a job: processes compare them before they run it together, and a store
-keeps them to refuse another job.
+program identify a job. Processes compare both before they run a job together, and a
+store contains both, so that it cannot be resumed by another job.
 """
 
 import hashlib
@@ -402,7 +402,7 @@ def first_failure(value: Any) -> tuple[Int[Array, ""], Int[Array, ""]]:
         jnp.concatenate([jnp.ravel(x).astype(jnp.int32) for x in parts])
         for parts in (codes, steps)
     ]
-    # The success appended above is found if there is no failure before it.
+    # If there is no failure, this search finds the success that is appended above.
     bad = ~is_success(flat[0]).at[-1].set(False)
     first = jnp.argmax(bad)
     return flat[0][first], flat[1][first]
@@ -463,8 +463,8 @@ def call_description(
 def program_text(job: Job, reductions: Any = ()) -> str:
     """Write the jaxpr of one member and of the reductions.
 
-    Digests of the arrays in the jaxprs follow them. Addresses of functions, which
-    differ between processes, are removed.
+    The text ends with digests of the arrays in the jaxprs. Addresses of functions,
+    which differ between processes, are removed.
     """
 
     def run(one):

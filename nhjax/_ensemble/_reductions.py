@@ -2,8 +2,8 @@
 
 A reduction has a state of fixed size. `update` adds the members of a chunk to a state,
 `merge` combines the states of two sets of members, and `finish` computes the statistic.
-Sums are kept in double-double arithmetic, so that another size of the chunks changes at
-most the last bit of the result.
+Sums are computed in double-double arithmetic, so that another size of the chunks
+changes at most the last bit of the result.
 """
 
 import math
@@ -246,7 +246,7 @@ class _AbstractExtreme(AbstractReduction):
 class Minimum(_AbstractExtreme):
     """The minimum over the members of an ensemble, for every number `run` returns.
 
-    It is NaN if the value of a member that has not failed is NaN.
+    The minimum is NaN if the value of a member that has not failed is NaN.
 
     **Arguments:**
 
@@ -271,7 +271,7 @@ class Minimum(_AbstractExtreme):
 class Maximum(_AbstractExtreme):
     """The maximum over the members of an ensemble, for every number `run` returns.
 
-    It is NaN if the value of a member that has not failed is NaN.
+    The maximum is NaN if the value of a member that has not failed is NaN.
 
     **Arguments:**
 
@@ -351,9 +351,9 @@ class Histogram(AbstractReduction):
     ) -> PyTree[Array]:
         """Count the members of a chunk.
 
-        The state holds the number of members, the number that are not NaN, and for each
-        edge the number at or above it. Comparing with every edge is faster than adding
-        at indices.
+        The state has the number of members, the number that are not NaN, and for each
+        edge the number at or above it. Comparing all members with every edge is faster
+        than finding the bin of each member and incrementing its count.
         """
 
         def leaf(x):
@@ -399,8 +399,8 @@ class HistogramCounts(eqx.Module):
     - `edges`: the b + 1 edges.
     - `counts`: the number of members in each bin, of shape (..., b) for an array of
         shape (...).
-    - `below`, `above`: the number of members below the first edge, and at or above the
-        last one.
+    - `below`, `above`: the number of members below the first edge, and the number at or
+        above the last edge.
     - `nan`: the number of members that are NaN.
     """
 
@@ -472,12 +472,14 @@ def fold(
 ) -> PyTree[Array]:
     """Merge the states of the c members of a chunk, in an order that depends only on c.
 
-    About √c states collect members side by side and are merged at the end. This needs
-    only about 2√c iterations, uses long vectors, and stores only about √c states.
+    About √c states each collect about √c members. All these states are updated at the
+    same time, as vectors, and are merged at the end. This needs only about 2√c
+    iterations, and memory for only about √c states.
 
     **Arguments:**
 
-    - `lift`: creates the state of one member from its value and whether it counts.
+    - `lift`: creates the state of one member from its value and from a boolean, which
+        is False for a member that does not count.
     """
     size = counts.shape[0]
     columns = max(1, math.isqrt(size))

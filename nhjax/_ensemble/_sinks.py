@@ -147,7 +147,7 @@ class AbstractSink(abc.ABC):
 
     @abc.abstractmethod
     def collect(self, chunk: int, content: Any, failures: list[list[int]]) -> None:
-        """Keep the content and the failures of a chunk."""
+        """Store the content and the failures of a chunk."""
 
     @abc.abstractmethod
     def outcome(self) -> EnsembleOutcome:
@@ -159,7 +159,7 @@ class AbstractSink(abc.ABC):
 
 
 class MemorySink(AbstractSink):
-    """Keeps all values in NumPy arrays; in the end every process has all of them."""
+    """Stores all values in NumPy arrays; in the end every process has all values."""
 
     def __init__(self, job: Job):
         self.job, self.failures = job, FailureList()
@@ -219,7 +219,7 @@ class MemorySink(AbstractSink):
 
 
 class ReductionSink(AbstractSink):
-    """Keeps states of reductions, whose size does not depend on the number of members.
+    """Stores states of reductions, whose size does not depend on the ensemble's size.
 
     By default each process runs consecutive chunks, and the states of processes are
     merged at the end. With `in_rounds`, the states of each round are merged in the
@@ -326,7 +326,8 @@ class ReductionSink(AbstractSink):
         return jax.device_put(state, self.job.layout.devices[0])
 
     def _packed(self, state: Any, failures: FailureList) -> bytes:
-        # Dtypes are included, because the neutral state may have other dtypes.
+        # Dtypes are included, because the states that `init` and `update` of a user's
+        # reduction return may have different dtypes.
         leaves = [np.asarray(x) for x in jax.tree.leaves(state)]
         kinds = json.dumps([[x.dtype.name, x.shape] for x in leaves]).encode()
         head = np.int64(len(kinds)).tobytes() + kinds

@@ -362,7 +362,7 @@ class CheckpointedReductionSink(AbstractSink):
 
     def _resume(self) -> None:
         for path in self.path.glob(".*"):
-            # A temporary file of `save` that a killed process has left.
+            # Delete a temporary file of `save` that a killed process has left.
             if re.fullmatch("[.][0-9a-f]{32}", path.name):
                 path.unlink()
         try:

@@ -68,7 +68,7 @@ def _bicycle(machine: systems.WhippleBicycle) -> Looks:
         return np.array([foot - height * math.tan(tilt), 0.0, height])
 
     def bars(hub, color, radius, *pairs):
-        """Return bars between points of the upright bicycle, seen from a hub."""
+        """Return bars between points of the upright bicycle, relative to a hub."""
         return [rod(a - hub, b - hub, radius, color) for a, b in pairs]
 
     def at(x, y, z):
@@ -115,7 +115,8 @@ def _bicycle(machine: systems.WhippleBicycle) -> Looks:
 
     def poses(t, q, args):
         points = machine.points(t, q)
-        # The coordinates have z down. With z up, turns about y and z change sign.
+        # In the coordinates of the bicycle z points down. Here z points up, so that
+        # rotations about y and z have the opposite sign.
         rotation = about("z", -q[2]) @ about("x", q[3]) @ about("y", -q[4])
         steered = rotation @ _about(axis.astype(q.dtype), q[5])
         return {
@@ -167,7 +168,8 @@ def _two_wheeled_robot(machine: systems.TwoWheeledRobot) -> Looks:
 def _car(machine: systems.CarWithTrailers) -> Looks:
     base = float(machine.wheelbase)
     radius, track = 0.12 * base, 0.28 * base
-    # The rolling of the wheels is no coordinate of the car: they have no marks.
+    # The rotation angles of the wheels are not coordinates of the car. Therefore the
+    # wheels have no marks that would show their rotation.
     axle = "".join(
         cylinder((0, y - w, 0), (0, y + w, 0), radius, DARK)
         for y, w in ((track, 0.04 * base), (-track, 0.04 * base))
@@ -218,7 +220,7 @@ def _car(machine: systems.CarWithTrailers) -> Looks:
 
 
 def _axle(track: float, radius: float) -> str:
-    """Return an axle along y with two wheels, whose rolling is no coordinate."""
+    """Return an axle along y with two wheels, which have no marks."""
     width = 0.3 * radius
     ends = (
         cylinder((0, y - width, 0), (0, y + width, 0), radius, DARK)
@@ -293,13 +295,13 @@ def _roller_racer(machine: systems.RollerRacer) -> Looks:
 
 
 def _skate(size: float, *others: str) -> str:
-    """Return a blade along x that stands on the ground, with other shapes."""
+    """Return a blade along x on the ground, and the other shapes of its body."""
     blade = box((0.16 * size, 0.008 * size, 0.05 * size), GREY, (0, 0, 0.05 * size))
     return blade + "".join(others)
 
 
 def _on_blade(name: str, text: str) -> Looks:
-    """Return the looks of a body in the plane with q = (x, y, heading)."""
+    """Return the looks of a body that moves in the plane, with q = (x, y, heading)."""
 
     def poses(t, q, args):
         return {name: (flat(q[:2]), about("z", q[2]))}
@@ -337,7 +339,8 @@ def _unicycle(machine: Any) -> Looks:
     seat = 1.9 * radius
     looks = _on_blade(
         "unicycle",
-        # The rolling of the wheel is no coordinate: it has no mark.
+        # The rotation angle of the wheel is not a coordinate. Therefore the wheel has
+        # no mark that would show its rotation.
         frame(
             ring(0.92 * radius, 0.08 * radius, DARK),
             cylinder((0, -0.02, 0), (0, 0.02, 0), 0.85 * radius, GREY),
@@ -462,7 +465,8 @@ def _ball_in_bowl(machine: systems.BallInBowl) -> Looks:
     reach = max(1.4 * start, 4 * radius)
     if machine.shape == "sphere" and curvature:
         reach = min(reach, 0.97 / curvature)
-    # The bowl is the parallel surface, `radius` below the path of the centre.
+    # The centre of the ball moves on the surface z(r). The bowl is the parallel surface
+    # at the distance `radius` below this surface.
     r = np.linspace(0, reach, 200)
     if machine.shape == "sphere" and curvature:
         z = (1 - np.sqrt(1 - (curvature * r) ** 2)) / curvature
@@ -534,7 +538,7 @@ def _turntable_ball(machine: systems.TurntableBall) -> Looks:
 
 
 def _attitude(name: str, *geoms: str, **options: Any) -> Looks:
-    """Return the looks of a body that turns about the origin, with q its attitude."""
+    """Return the looks of a body that turns about the origin; q is its attitude."""
 
     def poses(t, q, args):
         return {name: (jnp.zeros(3, q.dtype), SO3().matrix(q[:4]))}
@@ -543,7 +547,7 @@ def _attitude(name: str, *geoms: str, **options: Any) -> Looks:
 
 
 def _box_of(moments: Any) -> tuple[str, list[float]]:
-    """Return a box with the given moments of inertia, with marks, and its half size."""
+    """Return a marked box with the given moments of inertia, and its half lengths."""
     own = np.asarray(moments, float)
     squares = np.maximum(own.sum() / 2 - own, 0.02 * own.sum())
     half = (0.4 * np.sqrt(squares / squares.max())).tolist()
@@ -560,7 +564,7 @@ def _rigid_body(machine: systems.FreeRigidBody) -> Looks:
 
 def _suslov(machine: systems.Suslov) -> Looks:
     shape, half = _box_of(machine.moments)
-    # The axis about which the body cannot turn.
+    # The bar shows the axis about which the body cannot turn.
     needle = rod((0, 0, -1.5 * half[2]), (0, 0, 1.5 * half[2]), 0.015, GREY)
     return _attitude("body", shape, needle, ground=None)
 
@@ -615,7 +619,7 @@ def _particle(machine: Any) -> Looks:
 
 
 def _beads(machine: Any) -> Looks:
-    """Show each coordinate as the place of a bead on a bar of its own along x."""
+    """Show each coordinate as the position of a bead on its own bar along x."""
     count = int(machine.q0.shape[0])
     size = 0.5 * (float(jnp.max(jnp.abs(machine.q0))) or 1.0)
     apart = size * (np.arange(count) - 0.5 * (count - 1))
@@ -637,12 +641,12 @@ def _beads(machine: Any) -> Looks:
 
 
 def _transmission(machine: systems.ContinuouslyVariableTransmission) -> Looks:
-    """Show the driver as a pendulum, which steers the blade below the passenger."""
+    """Show the driver as a pendulum, and the passenger on a blade that it steers."""
     pivot, top, foot = np.array([[0, 1.5, 1.2], [0, 1.7, 1.2], [0, 1.7, 0]])
 
     def poses(t, q, args):
         x, y, z = q
-        # The passenger moves along (1, -sin y) in the plane of x and z.
+        # The passenger moves along (1, -sin y) in the plane of the coordinates x and z.
         heading = -jnp.arctan(jnp.sin(y))
         return {
             "driver": (jnp.asarray(pivot, q.dtype), about("y", -y)),
@@ -684,8 +688,9 @@ def _linkage(
 ) -> Looks:
     """Return the looks of bars between points, with balls and boxes at some of them.
 
-    Points of the plane are in a vertical plane. `masses` are the radii of the balls, in
-    units of the longest bar; `boxes` are sliders; `fixed` points stay at rest.
+    Points with two coordinates are drawn in a vertical plane. `masses` are the radii of
+    the balls, divided by the length of the longest bar; `boxes` are the names of
+    sliders; `fixed` are the names of points that stay at rest.
     """
 
     def in_space(t, q):
@@ -729,7 +734,7 @@ def _linkage(
         here = in_space(t, q)
         return jnp.stack([here[name] for name in trails])
 
-    # The camera looks straight at the plane.
+    # The camera looks at the plane along its normal, slightly from above.
     given: dict[str, Any] = {"ground": None, "azimuth": 90.0, "elevation": -8.0}
     given |= options
     return Looks(model(*parts, *still), poses, paths if trails else None, **given)
@@ -821,7 +826,7 @@ def _governor(machine: systems.FlyballGovernor) -> Looks:
 def _car_axis(machine: systems.CarAxis) -> Looks:
     length, rest = float(machine.length), float(machine.rest_length)
     tube = 0.03 * length
-    # A spring is a piston in a cylinder, so that its length can change.
+    # A spring is drawn as a piston in a cylinder, so that its length can change.
     parts = [body("axle", link(length, tube, BLUE))]
     for side in ("left", "right"):
         parts += [
@@ -858,7 +863,7 @@ def _car_axis(machine: systems.CarAxis) -> Looks:
 
 
 def _trails(machine: Any, *names: str) -> Callable[..., Array]:
-    """Return the places of some points of a machine that drives on the ground."""
+    """Return a function for the `trails` of named points, drawn on the ground."""
 
     def trails(t, q, args):
         points = machine.points(t, q)
@@ -869,7 +874,7 @@ def _trails(machine: Any, *names: str) -> Callable[..., Array]:
 
 
 def _about(axis: Array, angle: Array) -> Array:
-    """Compute the rotation about a unit vector."""
+    """Compute the matrix of the rotation by an angle about a unit vector."""
     half = 0.5 * angle
     return SO3().matrix(jnp.append(jnp.cos(half)[None], jnp.sin(half) * axis))
 

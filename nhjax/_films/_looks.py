@@ -1,7 +1,8 @@
 """The looks of a machine: shapes in MJCF, and the poses of the bodies that have them.
 
-The functions below `Looks` write the shapes of the gallery's machines. A wheel has its
-axle along y, and a body that lies between two points lies along its z axis.
+The functions after the class `Looks` write the shapes of the gallery's machines. In
+these functions, a wheel has its axle along the y axis of its body, and a body that lies
+between two points has its z axis along the line between them.
 """
 
 import math
@@ -22,21 +23,24 @@ Pose: TypeAlias = tuple[Float[Array, "3"], Float[Array, "3 3"]]
 
 
 class Looks(eqx.Module):
-    """The shapes of a machine, and where they are at a configuration.
+    """The shapes of a machine, and a function that places them.
 
-    `nhjax.render` and `nhjax.view` accept a `Looks`. The machines of `nhjax.systems`
-    and the robots of `from_mujoco` need none.
+    `nhjax.render` and `nhjax.view` accept a `Looks` in place of a machine. The machines
+    of `nhjax.systems` and the robots of `from_mujoco` do not need a `Looks`.
 
     - `mjcf`: the shapes, as the text of an MJCF model. Its bodies are children of
-        `<worldbody>`, have names and no joints. Geoms of the world itself do not move.
+        `<worldbody>`, have names and have no joints. Geoms (shapes) that are direct
+        children of `<worldbody>` do not move.
     - `poses`: a function of (t, q, args) that returns a dictionary from the names of
-        the bodies to pairs: the position [m], of shape (3,), and the rotation to space,
-        of shape (3, 3). z points upwards. `args` is always None.
+        the bodies to pairs: the position [m], of shape (3,), and the matrix of the
+        rotation from the body to space, of shape (3, 3). z points upwards. `args` is
+        always None.
     - `trails`: a function of (t, q, args) that returns points [m], of shape (k, 3),
         whose paths are drawn, such as the contacts of wheels; None draws no paths.
-    - `ground`: the height of the ground [m]. None puts it just below everything.
-    - `azimuth`, `elevation`: the default direction of the camera [degrees]: 90 looks
-        along y, and negative elevations look down.
+    - `ground`: the height of the ground [m]. With None the ground is just below all
+        shapes.
+    - `azimuth`, `elevation`: the default direction of the camera [degrees]. With
+        azimuth 90 the camera looks along y, and with negative elevations it looks down.
     - `manifold`: the manifold of the configurations, for the interpolation between
         saved states. The default is R^n.
 
@@ -76,16 +80,16 @@ def model(*parts: str, assets: str = "") -> str:
 
 
 def body(name: str, *geoms: str) -> str:
-    """Return a body with geoms."""
+    """Return the MJCF element of a body with geoms."""
     return f"<body name='{name}'>{''.join(geoms)}</body>"
 
 
 def frame(*geoms: str, pos: Numbers = (0, 0, 0), turn: str = "") -> str:
-    """Return geoms in a frame; `turn` is an attribute such as `euler='0 0 1'`."""
+    """Return geoms in a frame; `turn` is its rotation, such as `euler='0 0 1'`."""
     return f"<frame pos='{_text(pos)}' {turn}>{''.join(geoms)}</frame>"
 
 
-# The `turn` of a wheel, so that its axle is along z of its body instead of y.
+# The argument `turn` of `frame` that turns the axle of a wheel from y to z of its body.
 AXLE_ALONG_Z = f"euler='{-math.pi / 2} 0 0'"
 
 
@@ -171,7 +175,8 @@ def half_ellipsoid(name: str, semiaxes: Numbers) -> str:
 def bowl(name: str, heights: Numbers, radius: float) -> str:
     """Return the asset of a surface of revolution, as a mesh with two sides.
 
-    `heights` are its heights at equal distances from the axis, from 0 to `radius`.
+    `heights` are the heights of the surface at equally spaced distances from the axis,
+    from 0 to `radius`.
     """
     num = 48
     turn = 2 * np.pi * np.arange(num) / num
@@ -188,7 +193,8 @@ def bowl(name: str, heights: Numbers, radius: float) -> str:
             a, b = i * num + k, i * num + following
             faces += [(a, a + num, b + num), (a, b + num, b)]
     inside = np.asarray(faces)
-    # The other side has its own vertices, because its normals are opposite.
+    # The other side of the surface has its own vertices, because its normals are
+    # opposite.
     outside = inside[:, ::-1] + len(points)
     thick = points - [0, 0, 0.01 * radius]
     vertices = np.concatenate([points, thick])
@@ -211,7 +217,8 @@ def between(start: Array, end: Array) -> Pose:
 def along(direction: Array) -> Float[Array, "3 3"]:
     """Return a rotation whose third axis has the given direction."""
     z = direction / jnp.sqrt(direction @ direction)
-    # The coordinate axis farthest from the direction is never parallel to it.
+    # The coordinate axis with the largest angle to the direction is never parallel to
+    # the direction.
     aside = jnp.eye(3, dtype=z.dtype)[jnp.argmin(jnp.abs(z))]
     x = jnp.cross(aside, z)
     x = x / jnp.sqrt(x @ x)
@@ -219,7 +226,7 @@ def along(direction: Array) -> Float[Array, "3 3"]:
 
 
 def about(axis: str, angle: Any) -> Float[Array, "3 3"]:
-    """Return the rotation about "x", "y" or "z"."""
+    """Return the rotation matrix for an angle about "x", "y" or "z"."""
     angle = jnp.asarray(angle)
     k = "xyz".index(axis)
     i, j = (k + 1) % 3, (k + 2) % 3
@@ -229,12 +236,12 @@ def about(axis: str, angle: Any) -> Float[Array, "3 3"]:
 
 
 def flat(point: Array, height: Any = 0.0) -> Float[Array, "3"]:
-    """Return a point of the ground plane, or at a height above it."""
+    """Return the point in space with the given point (x, y) and height."""
     return jnp.append(point, jnp.asarray(height, point.dtype))
 
 
 def upright(point: Array) -> Float[Array, "3"]:
-    """Return a point of a vertical plane, whose second coordinate is the height."""
+    """Return the point (x, 0, z) in space for a point (x, z) of a vertical plane."""
     return jnp.stack([point[0], jnp.zeros_like(point[0]), point[1]])
 
 

@@ -38,8 +38,9 @@ def render(
 ) -> Path:
     """Write a film of a run, with light and shadows, or a picture of one time.
 
-    MuJoCo's renderer draws the shapes off screen. The film plays at the speed of the
-    motion for any step sizes: configurations between saved states are interpolated.
+    MuJoCo's renderer draws the shapes off screen. Configurations between saved states
+    are interpolated, so that the film plays at the speed of the motion for any step
+    sizes.
 
     **Arguments:**
 
@@ -54,9 +55,11 @@ def render(
         without `"lookat"` follows the machine.
     - `fps`: the number of frames in a second of the film.
     - `speed`: the number of seconds of the motion in a second of the film.
-    - `size`: width and height in pixels; both even for `.mp4`.
-    - `t`: the time of the picture, for `.png`. The default is the last time.
-    - `trail`: whether to draw the paths of contacts.
+    - `size`: the width and the height in pixels; both must be even for `.mp4`.
+    - `t`: the time of the picture, only for `.png`. The default is the last time of the
+        run.
+    - `trail`: whether to draw the paths of contact points, or the `trails` of a
+        `Looks`.
 
     **Returns:** the path of the file.
 
@@ -78,7 +81,8 @@ def render(
     check_solution("render", sol)
     times = frame_times("render", sol, speed / fps)
     if target.suffix == ".png":
-        # The frames before the picture give the camera and the trail.
+        # The frames before the time of the picture are needed for the centre of the
+        # camera and the trail.
         end = times[-1] if t is None else t
         times = _until(times, end)
     scene = Scene("render", machine, sol, times, trail)
@@ -94,7 +98,7 @@ def render(
 
 
 class View(NamedTuple):
-    """A camera of the model, or a free camera with the points where it looks."""
+    """A named camera of the model, or a free camera and the points it looks at."""
 
     name: str | None
     centres: np.ndarray
@@ -137,7 +141,7 @@ def view_of(scene: Scene, camera: Any, size: tuple[int, int]) -> View:
             )
         return View(camera, centres, 0.0, 0.0, 0.0)
     half_angle = np.deg2rad(scene.model.vis.global_.fovy) / 2
-    # The narrower side of the picture must hold the machine.
+    # The whole machine must fit into the narrower side of the picture.
     half_angle = np.arctan(np.tan(half_angle) * min(1.0, size[0] / size[1]))
     distance = 1.2 * scene.reach(centres) / np.sin(half_angle)
     return View(
@@ -195,7 +199,7 @@ def _renderer(scene: Scene, size: tuple[int, int]) -> Iterator[Any]:
 
 
 def _draw_trails(mujoco: Any, drawn: Any, scene: Scene, k: int) -> None:
-    """Add the paths until the k-th time to the shapes of a picture."""
+    """Add the paths from the first to the k-th time to the shapes of a picture."""
     kind = mujoco.mjtGeom.mjGEOM_CAPSULE
     width = 0.006 * scene.model.stat.extent
     for path in scene.trails:
@@ -220,7 +224,7 @@ def _gl_context(size: tuple[int, int]) -> Any:
     """Create an OpenGL context without a window."""
     chosen = os.environ.get("MUJOCO_GL", "").lower().strip()
     if sys.platform == "linux" and not chosen:
-        # MuJoCo's own default needs a display, and ends the process without one.
+        # MuJoCo's default needs a display, and ends the process if there is no display.
         os.environ["MUJOCO_GL"] = chosen = "egl"
     try:
         if chosen in ("egl", "osmesa"):
@@ -294,7 +298,7 @@ def _write_mp4(
     command = [
         *(encoder.get_ffmpeg_exe(), "-y", "-loglevel", "error", "-f", "rawvideo"),
         *("-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps}", "-i", "-"),
-        # Many players and browsers show this format of pixels only.
+        # Many players and browsers can only show this pixel format.
         *("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "23"),
         *("-movflags", "+faststart", str(path)),
     ]
@@ -303,7 +307,7 @@ def _write_mp4(
             command, stdin=subprocess.PIPE, stderr=messages
         ) as process:
             assert process.stdin is not None
-            # If the encoder ends early, its message says why.
+            # If the encoder ends early, its message is raised below.
             with contextlib.suppress(BrokenPipeError):
                 for frame in frames:
                     process.stdin.write(frame.tobytes())
@@ -319,13 +323,13 @@ def _write_gif(
 ) -> None:
     image = _image()
     pictures = [image.fromarray(frame) for frame in frames]
-    # One palette for all frames: otherwise colours flicker.
+    # All frames use one palette: with a palette for each frame, colours would flicker.
     some = pictures[:: max(1, len(pictures) // 8)]
     sheet = image.new("RGB", (size[0], size[1] * len(some)))
     for k, picture in enumerate(some):
         sheet.paste(picture, (0, k * size[1]))
-    # The first 176 colours are the frequent ones; the others keep the colours of
-    # small parts.
+    # 176 colours of the palette are the most frequent ones. The other 80 are chosen for
+    # their distance, so that small parts keep their colours.
     frequent = sheet.quantize(176, image.Quantize.MEDIANCUT).getpalette()
     apart = sheet.quantize(80, image.Quantize.MAXCOVERAGE).getpalette()
     palette = image.new("P", (1, 1))

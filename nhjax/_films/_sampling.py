@@ -39,7 +39,7 @@ def frame_times(who: str, sol: Solution, spacing: float) -> np.ndarray:
     else:
         first, last = float(sol.t0), float(sol.t1)
     duration = abs(last - first)
-    # Round-off must not cost the last frame.
+    # Without the factor, round-off could remove the last frame.
     steps = np.arange(int(duration / spacing * (1 + 1e-9)) + 1)
     return first + np.sign(last - first) * np.minimum(steps * spacing, duration)
 
@@ -52,9 +52,9 @@ def configurations(
 ) -> PyTree[Array]:
     """Compute the configurations at given times, stacked along the first axis.
 
-    Dense output is evaluated if `sol` has it. Otherwise, between two saved states, q
-    follows a cubic polynomial in the chart at the earlier state, which matches the
-    configurations and the velocities of both states.
+    If `sol` has dense output, this output is evaluated. Otherwise, between two saved
+    states, q follows a cubic polynomial in the chart at the earlier state. The
+    polynomial matches the configurations and the velocities of both states.
     """
     if sol.interpolation is not None:
         evaluate = jax.jit(jax.vmap(lambda t: sol.evaluate(t).q))
@@ -117,8 +117,8 @@ def _between_rows(
     @jax.jit
     @jax.vmap
     def interpolate(q, chord, first, last, s):
-        # The cubic with the values 0 and `chord` and the slopes `first` and `last` at
-        # its ends.
+        # The cubic polynomial has the values 0 and `chord` and the derivatives `first`
+        # and `last` at s = 0 and s = 1.
         xi = s * (1 - s) * ((1 - s) * first - s * last) + s * s * (3 - 2 * s) * chord
         return group.compose(q, group.retract(xi))
 
@@ -126,16 +126,16 @@ def _between_rows(
     return interpolate(*at, share)
 
 
-# The defect is the displacement minus the step times the mean of the velocities at both
-# ends, relative to this product. A harmonic motion with four saved states in a period
-# has the defect tan(π/4) / (π/4) - 1 = 0.27.
+# For two saved states, the travel is the step times the mean of their velocities. The
+# defect is the displacement minus the travel, relative to the travel. A harmonic motion
+# with four saved states in a period has the defect tan(π/4) / (π/4) - 1 = 0.27.
 _LARGEST_DEFECT = 0.25
 
 
 def _check_spacing(
     who: str, chords: np.ndarray, first: np.ndarray, last: np.ndarray
 ) -> None:
-    """Raise if positions and velocities show that states are missing in between."""
+    """Raise if the saved states are so far apart that their velocities contradict q."""
     travel = (first + last) / 2
     sizes = np.sqrt(np.mean(travel**2, axis=0))
     defects = np.sqrt(np.mean((chords - travel) ** 2, axis=0))

@@ -20,8 +20,8 @@ from ._sampling import configurations
 class Subject(NamedTuple):
     """A machine that a film can show.
 
-    - `spec`: the shapes as an `MjSpec`, or the robot's own `MjModel`.
-    - `robot` or `looks`: the machine.
+    - `spec`: the shapes, as an `MjSpec` or as the robot's own `MjModel`.
+    - `robot`, `looks`: the machine is one of these two, and the other is None.
     """
 
     spec: Any
@@ -48,7 +48,7 @@ def subject_of(who: str, machine: Any) -> Subject:
     except ValueError as error:
         raise ValueError(f"{who}: MuJoCo cannot read the `mjcf`: {error}") from error
     for body in spec.worldbody.bodies:
-        # The bodies are placed by their poses, not by dynamics.
+        # The function `poses` places the bodies, not dynamics.
         body.mocap = True
     system = getattr(machine, "system", None)
     own = getattr(system, "manifold", None)
@@ -59,9 +59,9 @@ class Scene:
     """A model with the poses of a machine at some times.
 
     - `times`: the times, of shape (k,).
-    - `centres`: where the camera of a film looks, of shape (k, 3).
-    - `reach(centres)`: the radius of the balls about these centres, one for each time,
-        that contain the machine.
+    - `centres`: the points at which the camera of a film looks, of shape (k, 3).
+    - `reach(centres)`: the common radius of balls about the given centres, one for each
+        time, that contain the machine.
     - `trails`: the paths to draw, of shape (paths, k, 3).
     """
 
@@ -79,7 +79,7 @@ class Scene:
         self.data = self._mujoco.MjData(self.model)
 
     def _places(self, who: str, subject: Subject, q: Any) -> tuple[Any, Any, Any]:
-        """Return qpos, the poses of the bodies, and the model without a scene.
+        """Return qpos, the poses of the bodies, and the model without additions.
 
         For a robot the poses are None, and for a `Looks` qpos is None.
         """
@@ -133,7 +133,7 @@ class Scene:
         return np.swapaxes(np.asarray(points), 0, 1)
 
     def _measure(self, model: Any) -> None:
-        """Find where the machine is, how large it is, and how low it comes."""
+        """Compute the positions and the size of the machine, and its lowest point."""
         mujoco, data = self._mujoco, self._mujoco.MjData(model)
         solid = model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE
         # The fixed geoms of a `Looks` belong to the machine. The fixed geoms of a robot
@@ -158,21 +158,22 @@ class Scene:
         low, high = (places - radii[:, None]), (places + radii[:, None])
         box = (np.min(low, axis=(0, 1)), np.max(high, axis=(0, 1)))
         self.whole = (box[0] + box[1]) / 2
-        # A camera that follows a machine which stays in place would only shake.
+        # If a machine stays in place, a camera that follows it would only shake.
         steady = np.where(span < size, np.mean(middles, axis=0), middles)
         self.centres = _smoothed(steady, self.times)
         self.places, self.radii = places, radii
 
     def reach(self, centres: np.ndarray) -> float:
-        """Compute the radius of the balls about these centres that hold the machine."""
+        """Compute the radius of balls about these centres that contain the machine."""
         away = np.linalg.norm(self.places - centres[:, None], axis=2)
         return float(np.max(away + self.radii, initial=0.0)) or 1.0
 
     def _furnished(self, subject: Subject) -> tuple[Any, int | None]:
-        """Compile the model with ground, light and sky, if it lacks them."""
+        """Compile the model, with ground, light and sky added if they are missing."""
         mujoco = self._mujoco
         if not isinstance(subject.spec, mujoco.MjSpec):
-            # A copy, because the renderer writes the size of its pictures into it.
+            # Return a copy, because the renderer writes the size of its pictures into
+            # the model.
             return copy.copy(subject.spec), None
         spec, size = subject.spec.copy(), self.reach(self.centres)
         if subject.robot is not None:
@@ -231,6 +232,7 @@ class Scene:
         """Put the bodies and the light where they are at the k-th time."""
         if self._light is not None:
             # A directional light casts shadows only up to a distance from its position.
+            # Therefore it moves with the machine.
             distance = 5 * self.model.stat.extent
             self.model.light_pos[self._light] = self.centres[k] - distance * LIGHT
         self._move(self.model, self.data, k)
@@ -251,7 +253,7 @@ class Scene:
 # The direction of the light: from the left, from behind the camera, and from above.
 LIGHT = np.array([0.35, 0.45, -0.82]) / np.linalg.norm([0.35, 0.45, -0.82])
 # MuJoCo's colour for geoms that specify none. A geom of this colour shows the colour of
-# its material.
+# its material, if it has a material.
 PLAIN = [0.5, 0.5, 0.5, 1]
 
 
@@ -265,7 +267,7 @@ def _add_ground(mujoco: Any, spec: Any, height: float, size: float) -> None:
         width=256,
         height=256,
     )
-    # A texture is two cells wide. The width of a cell is a round length, at most the
+    # The texture is two cells wide. The width of a cell is a round length, at most the
     # size of the machine.
     cell = round_length(size)
     names = [""] * mujoco.mjtTextureRole.mjNTEXROLE
@@ -284,7 +286,8 @@ def _add_ground(mujoco: Any, spec: Any, height: float, size: float) -> None:
         size=[0, 0, cell],
         pos=[0, 0, height],
         material="nhjax ground",
-        # The defaults of the model may have a colour, or a group that is not drawn.
+        # These are set because the defaults of the model may set a colour, or a group
+        # that is not drawn.
         rgba=PLAIN,
         group=0,
     )
@@ -334,7 +337,8 @@ def _smoothed(centres: np.ndarray, times: np.ndarray) -> np.ndarray:
     width = max(1, len(times) // 20)
     if len(times) < 3:
         return centres
-    # Beyond its ends the path continues with the velocities at its ends.
+    # Before the first and after the last time, the path continues with its first and
+    # its last velocity.
     before = centres[0] + np.arange(-width, 0)[:, None] * (centres[1] - centres[0])
     after = centres[-1] + np.arange(1, width + 1)[:, None] * (centres[-1] - centres[-2])
     path = np.concatenate([before, centres, after])

@@ -17,8 +17,8 @@ class Show:
     """A machine in a browser, which `nhjax.view` returns.
 
     - `url`: the address of the page.
-    - `server`: the `viser.ViserServer`, to add shapes and controls to. Shapes whose
-        names start with `/scene/` stay in place on the ground.
+    - `server`: the `viser.ViserServer`, to which you can add shapes and controls.
+        Shapes whose names start with `/scene/` stay in place on the ground.
     """
 
     def __init__(self, server: Any, scene: Scene, speed: float):
@@ -29,7 +29,8 @@ class Show:
         self._frames = _add_shapes(server, scene)
         times = scene.times
         low, high = sorted((float(times[0]), float(times[-1])))
-        # With a round step, the slider shows round times.
+        # The step of the slider is a round length of time, so that the slider shows
+        # round times.
         self._step = round_length((high - low) / max(1, len(times) - 1) or 1.0)
         self._slider = server.gui.add_slider(
             "time [s]",
@@ -39,7 +40,8 @@ class Show:
             initial_value=low,
         )
         self._play = server.gui.add_checkbox("play", initial_value=len(times) > 1)
-        # The ground moves instead of the camera, which the user moves with the mouse.
+        # To follow the machine, the ground moves and not the camera, because the user
+        # moves the camera with the mouse.
         self._follow = server.gui.add_checkbox("follow", initial_value=True)
         self._follow.on_update(lambda _: self.show(self._slider.value))
         self._slider.on_update(lambda _: self.show(self._slider.value))
@@ -48,7 +50,7 @@ class Show:
         self._thread.start()
 
     def __repr__(self) -> str:
-        """Return the address of the page."""
+        """Return a text with the address of the page."""
         return f"<machine at {self.url}>"
 
     def show(self, t: float) -> None:
@@ -80,7 +82,7 @@ class Show:
             self.stop()
 
     def _run(self) -> None:
-        """Move the slider while the machine plays."""
+        """Move the slider while the switch "play" is on."""
         slider, pause, rest = self._slider, 1 / 30, 0.0
         while not self._stopped.wait(pause):
             if self._play.value:
@@ -106,22 +108,22 @@ def view(
     The machine stays in the middle of the picture while the ground moves past, unless
     the switch "follow" is off.
 
-    viser prints the address of the page. The function needs neither a window nor
-    OpenGL, because the browser draws.
+    viser prints the address of the page. `view` needs neither a window nor OpenGL,
+    because the browser draws the machine.
 
     **Arguments:**
 
     - `machine`, `sol`: as for `nhjax.render`.
     - `port`: the port of the server; if it is taken, the next free one is used.
     - `speed`: the number of seconds of the motion that are shown in one second.
-    - `block`: whether to wait until Ctrl-C. The default is True in a script, which
+    - `block`: whether `view` waits until Ctrl-C. The default is True in a script, which
         would otherwise end at once, and False in an interactive session.
 
     **Returns:** a `Show` with the fields `url` and `server` and the methods `show(t)`
     and `stop()`.
 
-    **Raises:** `ImportError` without viser (`pip install "nhjax[view]"`); otherwise as
-    `nhjax.render`.
+    **Raises:** `ImportError` without viser (`pip install "nhjax[view]"`), and otherwise
+    the errors of `nhjax.render` for the machine and the solution.
 
     !!! example
 
@@ -148,7 +150,7 @@ def view(
 
 
 def _add_shapes(server: Any, scene: Scene) -> dict[int, Any]:
-    """Add all geoms and trails, and return the frames of the bodies by number."""
+    """Add all geoms and trails; return a dictionary from body numbers to frames."""
     mujoco, model = mujoco_of("nhjax.view", "view"), scene.model
     server.scene.set_up_direction("+z")
     extent = float(model.stat.extent)
@@ -165,7 +167,8 @@ def _add_shapes(server: Any, scene: Scene) -> dict[int, Any]:
             server.scene.add_line_segments(
                 f"/scene/trails/{k}",
                 points=np.stack([path[:-1], path[1:]], axis=1).astype(np.float32),
-                # A trail in the plane of the ground would flicker.
+                # The trail is slightly above the ground, because a trail in the plane
+                # of the ground would flicker.
                 position=(0.0, 0.0, 0.004 * extent),
                 colors=(217, 64, 38),
                 thickness=0.006 * extent,

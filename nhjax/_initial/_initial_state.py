@@ -73,11 +73,12 @@ def initial_state(
 ) -> State:
     """Create a consistent state (q, v, p, λ) from a configuration and a v or p.
 
-    You give the velocity or the momentum; the other follows from the Legendre transform
-    p = D2L or v = D2H. The multiplier is the multiplier of the continuous problem. It
-    follows from the hidden constraints: dΦ/dt = 0 for nonholonomic and d²Γ/dt² = 0 for
-    holonomic constraints. With an inconsistent initial multiplier λ_0, a method with
-    the closure `"propagated"` has in general only order 2, for any number of stages.
+    You give the velocity or the momentum; the other of the two follows from the
+    Legendre transform p = D2L or v = D2H. The multiplier is the multiplier of the
+    continuous problem. It follows from the hidden constraints: dΦ/dt = 0 for
+    nonholonomic and d²Γ/dt² = 0 for holonomic constraints. With an inconsistent initial
+    multiplier λ_0, a method with the closure `"propagated"` has in general only order
+    2, for any number of stages.
 
     **Arguments:**
 
@@ -87,9 +88,10 @@ def initial_state(
     - `v`, `p`: velocity or momentum, shape (n,) with n the dimension of the manifold,
         of the dtype of q; on a group in the body frame. Give exactly one.
     - `t`, `args`: passed on to the functions of the system, as `integrate` does.
-    - `project`: replace q by the nearest configuration, and then v by the nearest
-        velocity, in the kinetic metric, that satisfies the constraints (one linear
-        solve for constraints linear or affine in v, Newton's method for others).
+    - `project`: whether to replace q by the nearest configuration, and then v by the
+        nearest velocity, that satisfies the constraints. Distances are measured in the
+        kinetic metric. The velocity needs one linear solve if the constraints are
+        linear or affine in v, and Newton's method otherwise.
     - `keep_q`, `keep_v`, `keep_p`: the components of q, v or p that the projection must
         not change: an index, a name or a sequence of them, known when tracing. Use
         `keep_v` with `v`, and `keep_p` with `p`. The projection then finds the nearest
@@ -97,11 +99,11 @@ def initial_state(
         constraints. An index is a position in the flattened `q` (for a tuple, in all
         its parts joined in order) or in `v` or `p`. A name is an entry of the
         `coordinates` of the system. If the kept components determine a constraint and
-        violate it, the error names both.
+        violate it, the error names the constraint and these components.
     - `throw`: whether to raise if there is no consistent state. If false, all numbers
-        of the state are then NaN, and `integrate` reports it as not finite; under
-        `vmap` the other members of an ensemble are not affected. Wrong types and shapes
-        raise in both cases.
+        of the state are then NaN, and `integrate` reports the state as not finite;
+        under `vmap` the other members of an ensemble are not affected. Wrong types and
+        shapes raise in both cases.
 
     **Returns:** a `State`.
 
@@ -131,8 +133,10 @@ def initial_state(
         >>> [float(x) for x in y0.v]
         [1.0, 1.0, 0.0]
 
-    In the next example a disc of radius 1 m rolls at exactly 3 m/s, because `keep_v`
-    keeps this speed. Its roll rate must then be 3 rad/s:
+    In the next example a disc of radius 1 m has the speed 3 m/s and the roll rate 0,
+    which violates the rolling constraint. The first projection changes both. In the
+    second projection `keep_v` keeps the speed of exactly 3 m/s, and the roll rate
+    becomes 3 rad/s:
 
         >>> disc = nhjax.systems.VerticalRollingDisc(radius=1.0).system
         >>> v = jnp.array([3.0, 0.0, 0.0, 0.0])
@@ -221,7 +225,8 @@ class _Projected(NamedTuple):
     - `q`, `u`, `v`, `p`: the position, the fibre coordinate, the velocity and the
         momentum of the state.
     - `lin`: the equations of motion, linearised at the state.
-    - `starts`: the Jacobians of the constraints where searches started.
+    - `starts`: the Jacobians of the constraints at the points where the searches for
+        the nearest points started.
     - `off_group`, `legendre_solved`, `projected`, `fixed_positions`,
         `fixed_velocities`: as in `Found`.
     """
@@ -292,8 +297,8 @@ def _noise(
     """Measure round-off, and set rows of D2Φ that are only round-off to exact zeros.
 
     A constraint that is the square of an expression has such a row at states that
-    satisfy it. The round-off of a row is measured along one direction, which is cheaper
-    than for all columns.
+    satisfy the constraint. The round-off of a row is measured along one direction,
+    which is cheaper than measuring it for all columns.
     """
     random = np.random.default_rng(0)
     sizes = random.uniform(0.5, 1.5, u.shape) * random.choice([-1.0, 1.0], u.shape)

@@ -1,8 +1,8 @@
 """The projection of a configuration and a velocity onto the constraints.
 
 A projection finds the nearest point on the constraints in the kinetic metric. The user
-may choose components of q, v or p that it keeps; the result is then the nearest among
-the points with the kept components.
+may choose components of q, v or p that the projection does not change. The result is
+then the nearest of all points on the constraints with the same kept components.
 """
 
 import operator
@@ -409,7 +409,7 @@ def _active(
 ) -> Float[Array, "l l"]:
     """Return the matrix that maps rows to their active combinations.
 
-    It is the identity if all combinations are active.
+    The matrix is the identity if all combinations are active.
     """
     combinations = active[:, None] * basis.T / sizes[None]
     same = jnp.eye(basis.shape[0], dtype=basis.dtype)
@@ -440,7 +440,8 @@ def _nearest(
     """
     jacobian = jax.jacrev(constraint)(x)
     size, terms = sizes(jacobian)
-    # Round-off of the constraint also changes y; if y is zero, there is no other one.
+    # Round-off of the constraint also changes y. If y is zero, this is the only
+    # round-off of y.
     reaction = inverse(metric) @ jacobian.T
     delassus = jacobian @ reaction
     if idle is not None:

@@ -1,7 +1,8 @@
 """Integration over many steps: the time loop, events, output and derivatives.
 
-`_integrate` checks the arguments. `_run` has the compiled programs, and outside of
-transformations `_chunks` calls them for one chunk of steps after the other. The plain
+`_integrate` checks the arguments. `_run` has the compiled programs. Outside of the
+transformations of JAX, `_chunks` calls such a program once for each chunk of steps. A
+stepper is the object that advances a run by one iteration of the time loop. The plain
 stepper in `_stepper` takes steps of equal size; the steppers in `_variable` and
 `_events` use it for steps of different sizes and for events. `_loop` has the time loop
 and the adjoints, which decide how the loop is differentiated. A further adjoint is in

@@ -1,4 +1,4 @@
-"""Checkpoints, from which a run continues bit for bit where another one ended."""
+"""Checkpoints, from which a later run continues an earlier run bit for bit."""
 
 from typing import Any, NamedTuple
 
@@ -26,13 +26,13 @@ MOST_STEPS = 2**31 - 1
 
 
 class Checkpoint(eqx.Module):
-    """All data that a run carries from step to step, to continue it bit for bit.
+    """All data that a later run needs to continue a run bit for bit.
 
     A `State` is not enough for this. The run adds up q and p by compensated sums, and
     also carries the rounding errors of these sums. The times t_k = t0 + k dt depend on
-    their origin t0. The iteration of a step starts from the linearisation of the
-    step before. `SaveAt(checkpoint=True)` saves a checkpoint, `integrate` accepts one
-    in place of a state, and `nhjax.save` writes one to a file.
+    their origin t0. Each step uses the linearised equations of motion that the previous
+    step computed at its end. `SaveAt(checkpoint=True)` saves a checkpoint, `integrate`
+    accepts a checkpoint in place of a state, and `nhjax.save` writes it to a file.
 
     - `state`: the last state of the run; if the run failed, the last good state.
     - `q_compensation`, `p_compensation`: the rounding errors of the sums q and p.
@@ -42,18 +42,19 @@ class Checkpoint(eqx.Module):
     - `dt`: the step size.
     - `num_steps`: the number of steps taken since `t0`.
     - `clock`: the data of the `stepsize_controller`; empty after a run with constant
-        steps. After a run whose steps differ, `t0` is the end of the run, and
+        steps. After a run whose steps differ in size, `t0` is the end of the run, and
         `num_steps` is zero.
 
     Under `vmap` every array has the batch as its leading axis. Derivatives pass through
     `state`, `t0` and `dt`.
 
     The bits of a result depend on the compiled instructions. A run in parts repeats a
-    run in one piece bit for bit if all parts save the same output, with the same
-    releases on the same machine. Under `jit` the run in one piece must also save a
-    checkpoint, as all parts except the last do. Otherwise the results agree up to
-    round-off. Samples by `SaveAt(ts=...)` and dense output count times from the start
-    of their own part.
+    run in one piece bit for bit if all these runs save the same output, and use the
+    same releases of JAX and nhjax on the same machine. Under `jit` the run in one piece
+    must also save a checkpoint, because all parts except the last save one. Otherwise
+    the results agree up to round-off. Dense output and the samples of `SaveAt(ts=...)`
+    also agree only up to round-off, because each part counts their times from its own
+    start.
 
     !!! example
 
@@ -88,8 +89,8 @@ class Checkpoint(eqx.Module):
 class Origin(NamedTuple):
     """The origin of the times t_k = t0 + (first_step + k) dt + shift of a run.
 
-    The shift is zero unless the step size differs from the step size before the
-    checkpoint.
+    The shift is zero unless the step size changes at the checkpoint from which the run
+    starts.
     """
 
     t0: FloatScalar
@@ -111,7 +112,7 @@ def start_of(
 
 
 def time_of(y0: State | Checkpoint, t0: FloatScalarLike | None) -> FloatScalarLike:
-    """Return the time of `y0`, where `t0` is the argument of the user."""
+    """Return the time of `y0`; `t0` is the argument of `integrate`."""
     if isinstance(y0, State):
         return 0.0 if t0 is None else t0
     if t0 is not None:
@@ -191,9 +192,10 @@ def _too_many(first: np.ndarray, number: np.ndarray) -> ValueError:
 def resumed(y0: Checkpoint, fresh: StepState) -> StepState:
     """Return the step state from which a resumed run starts.
 
-    `fresh` is the step state of a run from `y0.state`. Its linearisation replaces the
-    linearisation of the checkpoint if their matrices differ by more than eps^(1/4),
-    which happens if the run continues with another system or other args.
+    `fresh` is the step state of a run from `y0.state`. The linearisation of `fresh`
+    replaces the linearisation of the checkpoint if the matrices of the two differ by
+    more than eps^(1/4), relative to their sizes. This happens if the run continues with
+    another system or other args.
     """
     new, structure = jax.tree.flatten(fresh.lin)
     _check_arrays("linearisation", y0.linearisation, new)
@@ -219,8 +221,9 @@ def _agree(old: Linearisation, new: Linearisation) -> BoolScalar:
             strict=True,
         )
     ]
-    # An ill-conditioned inverse has fewer correct digits. Within this bound the
-    # Jacobian of the checkpoint is as good as a fresh one.
+    # The bound is far above eps, because an ill-conditioned inverse has few correct
+    # digits. If the matrices differ by less, the stage solver converges equally well
+    # with the Jacobian of the checkpoint as with a fresh Jacobian.
     small = float(jnp.finfo(pairs[0][0].dtype).eps) ** 0.25
     close = [max_norm(x - y) <= small * (max_norm(x) + max_norm(y)) for x, y in pairs]
     return jnp.all(jnp.stack(close))

@@ -1,11 +1,12 @@
 """The loop on the host that runs `integrate` in chunks of steps.
 
-Outside of transformations a run is not one compiled program. A program takes a chunk of
-steps: it leads from a carry to a carry, and writes rows to a buffer of fixed size. Its
-arguments include the first step, the number of steps and the stride of the output, so
-that a run of another length or with other output does not recompile. Between chunks the
-host moves the rows to the output, updates the progress meter, and stops the run after
-Ctrl-C.
+Outside of transformations a run is not one compiled program. Instead, a program takes a
+chunk of steps. It computes the loop carry after the chunk from the loop carry before
+it, and writes the output of the steps to the rows of a buffer of fixed size. Its
+arguments include the first step, the number of steps and the stride of the output,
+which is the number of steps from one saved state to the next. A run of another length
+or with other output therefore does not recompile. Between chunks the host moves the
+rows to the output, updates the progress meter, and stops the run after Ctrl-C.
 """
 
 import contextlib
@@ -24,23 +25,23 @@ from ._checkpoint import MOST_STEPS
 from ._progress_meter import AbstractProgressMeter
 
 
-# The size of the buffers of a chunk, in numbers, and limits of their length in rows.
+# The count of numbers in the buffers of a chunk, and the limits of their count of rows.
 _BUFFER_SIZE = 2**17
 _LEAST_ROWS, _MOST_ROWS = 16, 4096
 # Unless a progress meter sets the lengths of chunks, the first chunk has at most
 # `_FIRST_ITERATIONS` iterations, and later chunks take about `_SECONDS` or less.
 _FIRST_ITERATIONS = 256
 _SECONDS = 0.2
-# The number of times of `SaveAt(ts=...)` at which one call computes the output.
+# One call computes the output at this many of the times of `SaveAt(ts=...)`.
 SAMPLES_AT_ONCE = 64
-# A run without output after steps has this stride.
+# The stride of a run that saves no output after steps.
 NO_STRIDE = MOST_STEPS
 
 
 class Span(NamedTuple):
-    """The part of a run that a chunk takes, which its program gets as one array.
+    """The part of a run that one chunk takes; a program gets the fields in one array.
 
-    - `start`, `end`: the first iteration, and the one after the last.
+    - `start`, `end`: the first iteration, and the index after the last iteration.
     - `stride`: save the state after every `stride`-th step of the run.
     - `num_steps`: the number of steps of the run.
     - `saves_end`: whether to compute the output of the last state, 0 or 1.
@@ -58,7 +59,8 @@ class Output(NamedTuple):
 
     - `last`: the result of the last chunk.
     - `saved`: the saved rows, along a leading axis, or None.
-    - `records`: the records of all steps, or of the steps that were asked for.
+    - `records`: the records of all steps, or of the steps in the argument `recorded` of
+        `drive`; None if no records are kept.
     - `num_steps`: the number of steps for which there are rows.
     - `is_interrupted`: whether Ctrl-C ended the run before its last step.
     """
@@ -71,7 +73,7 @@ class Output(NamedTuple):
 
 
 def room_for(rows: PyTree[Any]) -> int:
-    """Return the number of rows of a buffer for rows of these shapes."""
+    """Return the number of rows of a buffer, given the arrays of one row."""
     numbers = sum(math.prod(x.shape) for x in jax.tree.leaves(rows))
     room = 2 ** int(math.log2(_BUFFER_SIZE / max(numbers, 1)))
     return min(max(room, _LEAST_ROWS), _MOST_ROWS)
@@ -96,16 +98,16 @@ def drive(
 
     **Arguments:**
 
-    - `chunk`: takes a chunk; a function of the carry, the log and the numbers of a
-        `Span`. Its result has the fields `carry`, `log`, `num_filled`, `saved` and
-        `records`.
+    - `chunk`: the function that takes a chunk of steps, called with the carry, the log
+        and the numbers of a `Span`. Its result has the fields `carry`, `log`,
+        `num_filled`, `saved` and `records`.
     - `carry`, `log`: the carry and the log before the first iteration.
-    - `num_steps`, `num_iterations`: the numbers of steps and of iterations.
+    - `num_steps`, `num_iterations`: the numbers of steps and of iterations of the run.
     - `stride`, `room`: the stride of the output, and the number of rows of the buffers.
     - `saves_end`: a function that returns whether a run of a given number of steps
         saves its last state.
-    - `recorded`: the sorted indices of the steps whose records are needed; None for
-        all.
+    - `recorded`: the sorted indices of the steps whose records are needed; None if all
+        records are needed.
     - `keeps_records`: whether chunks return records of steps.
     - `meter`: the progress meter.
     - `may_end_early`: whether the run may end before its last iteration. The result of
@@ -174,12 +176,12 @@ def _span(*numbers: int) -> Array:
 
 
 def _rows(buffers: PyTree[Any], which: Any) -> PyTree[np.ndarray]:
-    # The rows are copied: a view would keep the whole buffer.
+    # The rows are copied, because a view would keep the whole buffer in memory.
     return jax.tree.map(lambda x: np.array(np.asarray(x)[which]), buffers)
 
 
 def _asked(recorded: np.ndarray | None, before: int, filled: int) -> Any:
-    """Find the rows of a buffer with records that are needed."""
+    """Find the rows of a buffer whose records are needed."""
     if recorded is None:
         return slice(filled - before)
     return recorded[(recorded >= before) & (recorded < filled)] - before
@@ -194,8 +196,9 @@ def _joined(pieces: list[PyTree[np.ndarray]]) -> PyTree[np.ndarray] | None:
 class _Schedule:
     """The lengths of the chunks, and the reports to the progress meter.
 
-    Events may take up to `surplus` additional iterations. After `done` iterations,
-    at least `done - surplus` steps are therefore complete, and only these are reported.
+    Events may take up to `surplus` additional iterations. After `done` iterations, at
+    least `done - surplus` steps are therefore complete, and only these steps are
+    reported.
     """
 
     def __init__(
@@ -208,7 +211,7 @@ class _Schedule:
         self._meter, self._num_steps = meter, num_steps
         self._may_end_early = may_end_early
         self._surplus = num_iterations - num_steps
-        # A meter shows the run in about a hundred parts.
+        # A meter is updated about a hundred times per run.
         self._every = max(1, num_steps // 100)
         self._next, self._percent = _FIRST_ITERATIONS, 0
 
@@ -222,12 +225,12 @@ class _Schedule:
         return min(self._every - steps % self._every, most)
 
     def finished(self, length: int, seconds: float) -> None:
-        """Set the length of the next chunk from the time that a chunk has taken."""
+        """Set the length of the next chunk from the time of the last chunk."""
         factor = _SECONDS / max(seconds, 1e-3 * _SECONDS)
         self._next = max(1, min(int(length * factor), 8 * self._next))
 
     def report_part(self, part: float) -> None:
-        """Report the part of a run that is done, from 0 to 1, as percents."""
+        """Report the part of a run that is done, from 0 to 1, as a percentage."""
         percent = int(100 * part)
         if not self._meter.silent and percent > self._percent:
             self._meter.update_part(percent)

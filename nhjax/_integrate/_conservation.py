@@ -32,13 +32,14 @@ from .._system import (
 )
 
 
-# Rates of change are checked at the initial state and at `_SAMPLES` states near it.
-# `_SPREAD` is the size of the random displacements that lead to these states.
+# The rates of change of the invariants are checked at the initial state and at
+# `_SAMPLES` states near it. `_SPREAD` is the size of the random displacements that lead
+# to these states.
 _SAMPLES, _SPREAD = 3, 0.3
 # The number of Newton iterations that move these states onto constraints on velocities,
 # which may be nonlinear.
 _ITERATIONS = 5
-# Rates of change below this many units of round-off per step are ignored.
+# If a rate of change is below this many units of round-off per step, it is ignored.
 _UNITS = 1e3
 
 
@@ -160,9 +161,11 @@ def conserves(
 ) -> BoolScalar:
     """Return whether the rate of change of invariants is zero, at a state and near it.
 
-    States near it are moved onto the constraints on velocities. States that still
-    violate them are ignored, and so are states at which the equations of motion have no
-    solution. With holonomic constraints, only the velocity is varied.
+    The other states are random displacements of this state, moved onto the constraints
+    on velocities. States that still violate these constraints are ignored, and so are
+    states at which the equations of motion have no solution. With holonomic
+    constraints, only the velocity is displaced, because displaced positions and times
+    may violate the constraints.
     """
     u0, manifold = system.fibre_coordinate(y), system.manifold_of(y.q)
     numbers = np.random.default_rng(0).standard_normal((2, _SAMPLES, u0.shape[0]))

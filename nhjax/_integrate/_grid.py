@@ -1,4 +1,4 @@
-"""The nodes of a run, and the checks of the arguments that give them."""
+"""The nodes of a run, and the checks of the arguments that determine the nodes."""
 
 from dataclasses import replace
 from typing import Any, TypeAlias
@@ -43,7 +43,7 @@ class TimeGrid(eqx.Module):
 
 
 class VariableGrid(eqx.Module):
-    """The nodes of a run whose steps differ.
+    """The nodes of a run whose steps differ in size.
 
     - `dt`: the step size that the user gave, or None.
     - `t1`: the end, or None for a run of `num_steps` steps.
@@ -65,7 +65,7 @@ class VariableGrid(eqx.Module):
         return self.max_steps if self.num_steps is None else self.num_steps
 
     def of_length(self, num_steps: Any) -> "VariableGrid":
-        """Return the same grid, with its own numbers of steps as arrays."""
+        """Return the same grid, with its numbers of steps and attempts as arrays."""
         del num_steps
         numbers = self.num_steps, self.max_steps
         number, most = (
@@ -85,7 +85,7 @@ class VariableGrid(eqx.Module):
 Grid: TypeAlias = TimeGrid | VariableGrid
 
 
-# The limit of diffrax, whose users expect it.
+# This limit is also the default limit of diffrax, so that users of diffrax know it.
 _MOST_STEPS = 4096
 _NEEDS_SIZE = (
     "`dt` is missing: nhjax.ConstantStepSize needs it. To let the size be chosen, pass "
@@ -103,7 +103,7 @@ def variable_grid(
 ) -> tuple[AbstractStepSizeController, VariableGrid, list[Check]]:
     """Return the controller, the nodes and the checks of a run whose steps differ.
 
-    **Raises:** `TypeError` and `ValueError` for arguments that do not belong together.
+    **Raises:** `TypeError` and `ValueError` for arguments that cannot be combined.
     """
     dtype, checks = t0.dtype, [finite("t0", t0)]
     if np.ndim(dt) > 1:

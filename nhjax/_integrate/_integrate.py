@@ -113,7 +113,7 @@ _BY_NEWTON = (
     "nhjax.SimplifiedNewton(fallback=True)` or `nhjax.Newton()",
 )
 # If the average step takes more iterations than this, the full Jacobian takes less time
-# on the machines that were measured (`benchmarks.iterations`).
+# on the mechanical systems that were measured (`benchmarks.iterations`).
 _MANY_ITERATIONS = 40
 # Runs with fewer steps than this cause no warning of slow convergence, because they
 # take less time than compiling another program.
@@ -159,30 +159,32 @@ def integrate(
     """Integrate a mechanical system over `num_steps` steps, or to the time `t1`.
 
     Each step solves the discrete equations of the paper (listed in its four summaries)
-    to round-off. So the constraints on velocities and positions hold at every node to
-    round-off as well. Compensated sums add the steps to q and p, and elements of a
-    group stay on the group.
+    to round-off. The constraints on velocities and positions therefore also hold to
+    round-off at the end of every step. Compensated sums add the steps to q and p, and
+    elements of a group stay on the group.
 
     `integrate` works under `jit`, `vmap`, `grad`, `jvp` and `hessian`, with respect to
     `y0`, `args`, `dt`, `t0` and the array leaves of `system`. Stage equations are
     differentiated by the implicit function theorem. To perturb a state, call
-    `initial_state` with the perturbed values: a step starts from q and p, and reads v
-    only for the first multiplier.
+    `initial_state` with the perturbed values. It is not enough to change v in a state,
+    because a step starts from q and p, and reads v only for the first multiplier.
 
     **Arguments:**
 
     - `system`: the mechanical system.
-    - `method`: such as `nhjax.LobattoIIIAB(stages=3)`; `Gauss` only without
-        constraints.
+    - `method`: the method, such as `nhjax.LobattoIIIAB(stages=3)`. `nhjax.Gauss`
+        supports only systems without constraints.
     - `y0`: a consistent state, from `nhjax.initial_state` or an earlier `Solution`.
-        Only the propagated closure uses its multiplier. `y0` may also be the
-        `Checkpoint` of an earlier run, which then continues bit for bit.
+        Only methods with the propagated closure use the multiplier of this state. `y0`
+        may also be the `Checkpoint` of an earlier run, which then continues bit for
+        bit.
     - `dt`: the step size, a scalar, in units of time; negative to integrate backwards.
         An array of shape (num_steps,) gives the size of each step. With a controller
-        that chooses the sizes, it is the first size, and may be left out.
+        that chooses the sizes, `dt` is the size of the first step, and may be left out.
     - `num_steps`: the number of steps, an int >= 1; see below for arrays.
     - `t0`: the time of `y0`, 0 by default. A checkpoint has its own time.
-    - `t1`: the end of the run, in place of `num_steps`. The last step ends there.
+    - `t1`: the end of the run, in place of `num_steps`. The last step ends exactly at
+        this time.
     - `args`: passed on to the functions of the system. Arrays and floats in it are
         traced, so that other values do not recompile. All other values are static.
 
@@ -202,18 +204,20 @@ def integrate(
         `max_steps` steps.
     - `adjoint`: which data reverse mode stores: `nhjax.DirectAdjoint()` by default,
         `nhjax.RecursiveCheckpointAdjoint()`, or `nhjax.ReversibleAdjoint()`.
-    - `throw`: raise an error if a step cannot be solved. Otherwise the trajectory stays
-        at its last good state, `result` and `stats` report the failure, and derivatives
-        are NaN (zero for a zero cotangent). Other members of a batch are not affected.
-    - `progress_meter`: such as `nhjax.TqdmProgressMeter()`.
+    - `throw`: whether to raise an error if a step cannot be solved. If false, the
+        trajectory stays at its last good state, `result` and `stats` report the
+        failure, and derivatives are NaN (zero for a zero cotangent). Other members of a
+        batch are not affected.
+    - `progress_meter`: the meter that shows how many steps are done, such as
+        `nhjax.TqdmProgressMeter()`.
     - `invariants`: quantities that the steps conserve to round-off at their values in
-        `y0`: `"energy"`, or a function that returns shape () or (k,). It is called with
-        (t, q, v, args), or (t, q, p, args) for a Hamiltonian system. The system itself
-        must conserve these quantities.
+        `y0`: `"energy"`, or a function that returns shape () or (k,). The function is
+        called with (t, q, v, args), or (t, q, p, args) for a Hamiltonian system. The
+        system itself must conserve these quantities.
         `docs/invariants.md` describes the method, its cost and its behaviour at rest.
-    - `event`: an `nhjax.Event`, or a sequence of them: zeros of functions of the state,
-        where the run ends or the state is reset. If a step has several events, the
-        earliest is handled first.
+    - `event`: an `nhjax.Event`, or a sequence of events. An event is a zero of a
+        function of the state, at which the run ends or the state is reset. If a step
+        has several events, the earliest is handled first.
 
     **Returns:** a `Solution`.
 
@@ -226,17 +230,19 @@ def integrate(
 
     !!! note
 
-        Outside of transformations, the host calls a compiled program that takes a
-        chunk of steps. Another `num_steps`, `SaveAt(steps=k)`, `adjoint` or
-        `progress_meter` does not recompile. The first run with `ts` or `dense` compiles
-        programs that keep the records of steps. Ctrl-C ends a run after the current
-        chunk, within about a fifth of a second: `integrate` warns and returns the
-        solution up to there, whose `result` is `nhjax.RESULTS.interrupted`.
+        Outside of transformations, the host calls a compiled program that takes a chunk
+        of steps. Another `num_steps`, `SaveAt(steps=k)`, `adjoint` or `progress_meter`
+        does not recompile. The first run with `ts` or `dense` compiles programs that
+        also store the stage values from which the output between steps is computed.
+        Ctrl-C ends a run after the current chunk, within about a fifth of a second:
+        `integrate` warns and returns the solution up to the end of this chunk, with the
+        `result` `nhjax.RESULTS.interrupted`.
 
         Under `jit` an int `num_steps` is static. An integer array is traced, and under
-        `vmap` each member may have its own number. With an array, `saveat` must not
-        have `steps`, `ts` or `dense`, because their output depends on the number.
-        Reverse mode needs an int, or `ReversibleAdjoint`.
+        `vmap` each member may have its own number of steps. With an array, `saveat`
+        must not have `steps`, `ts` or `dense`, because the shape of their output
+        depends on the number of steps. Reverse mode needs an int, or
+        `ReversibleAdjoint`.
 
     !!! note
 
@@ -319,12 +325,12 @@ def integrate(
         told = _BY_NEWTON if used_newton else _BY_FULL
         failed = int(sol.stats["failed_step"])
         warnings.warn(_REPEATED.format(failed, *told), stacklevel=2)
-        # The progress meter has already shown this run.
+        # The progress meter has already shown this run, so the repetition has no meter.
         again = SolverOptions(solver, adjoint, NoProgressMeter())
         try:
             sol = whole_run(system, method, y0, grid, args, options, saveat, again)
         except ForceSlopeError:
-            # Newton's method needs the same derivatives.
+            # Newton's method needs the same derivatives, and would fail too.
             used_newton = True
             break
     if valid is not None:
@@ -376,10 +382,10 @@ def step(
 
     The step solves the discrete equations of the paper (listed in its four summaries).
     The result equals the result of `integrate` with `num_steps=1` bit for bit. Use this
-    function for control loops, environments and other time loops that `integrate` does
-    not offer. It works under `jit`, `vmap`, `grad`, `jvp`, `hessian` and inside
-    `jax.lax.scan`. Over many steps `integrate` is faster, and its compensated sums lose
-    less to round-off.
+    function for control loops, for environments of reinforcement learning, and for
+    other time loops that `integrate` does not offer. It works under `jit`, `vmap`,
+    `grad`, `jvp`, `hessian` and inside `jax.lax.scan`. For many steps, `integrate` is
+    faster than a loop over `step`, and its compensated sums lose less to round-off.
 
     **Arguments:**
 
@@ -397,7 +403,7 @@ def step(
 
     **Returns:** the `State` at `t + dt`.
 
-    **Raises:** as `nhjax.integrate` does.
+    **Raises:** the same errors as `nhjax.integrate`.
 
     !!! example
 
@@ -455,14 +461,14 @@ def suggest_step(
 
     - `system`, `method`, `y0`, `args`, `stage_solver`: as for `nhjax.integrate`.
     - `t0`, `t1`: the start and the end of the trial, which should contain the fastest
-        phase of the motion; [s] or whatever the unit of time is.
+        phase of the motion; in the unit of time of the system.
     - `rtol`, `atol`: the tolerances of each step; `atol` is `rtol` by default.
     - `max_steps`: the largest number of attempts at a step.
 
     **Returns:** the step size, a float with the sign of t1 - t0.
 
     **Raises:** `IntegrationError` if the trial fails; `RuntimeError` under `jit` and
-    other transformations; otherwise as `nhjax.integrate`.
+    other transformations; otherwise the same errors as `nhjax.integrate`.
 
     !!! example
 
@@ -711,12 +717,13 @@ def _standstill_error(first: Any, h: Any) -> ValueError:
     )
 
 
-# JAX has an opaque trace state, which can only be compared with another state. In
-# releases of JAX in which this function is not public, `_is_tracing` is always True.
+# The function `get_opaque_trace_state` of JAX returns a value that identifies the
+# current transformations, and can only be compared with another such value. In releases
+# of JAX in which this function is not public, `_is_tracing` is always True.
 _trace_state = getattr(jax.extend.core, "get_opaque_trace_state", lambda **_: object())
 with jax.ensure_compile_time_eval():
-    # This is the state outside of all transformations, even if this module is imported
-    # inside one.
+    # This is the value outside of all transformations, even if this module is imported
+    # inside a transformation.
     _NOT_TRACING = _trace_state(convention="nhjax")
 
 

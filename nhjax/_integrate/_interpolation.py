@@ -29,7 +29,8 @@ def interpolate(
 
     The configuration q is the value of the continuous collocation polynomial u(t), and
     the momentum p is the value of the mixed polynomial v(t) of the paper's appendix.
-    Both polynomials are integrals of the Lagrange basis on the nodes c_i.
+    Both polynomials are integrals of polynomials that interpolate stage values at the
+    nodes c_i: the stage velocities for u(t), and the forces for v(t).
     """
     start, time = record.start, t + theta * h
     weights = method.integrated_basis(theta)
@@ -57,8 +58,8 @@ class DenseInterpolation(eqx.Module):
     """The collocation polynomials of a whole trajectory, one for each of its steps.
 
     They are defined from t0 to t0 + num_steps dt or, if the steps differ, to the end of
-    the run. `integrate` returns an instance with `SaveAt(dense=True)`; users evaluate
-    it through `Solution.evaluate`.
+    the run. `integrate` creates an instance if `SaveAt(dense=True)` is given; users
+    evaluate the polynomials by `Solution.evaluate`.
     """
 
     method: AbstractMethod = eqx.field(static=True)
@@ -152,7 +153,8 @@ def step_among(
 ) -> Int[Array, ""]:
     """Find the index of the step that contains the time t, among steps that differ.
 
-    `interval` has the starts and the sizes of the steps, of which `count` are valid.
+    `interval` has the starts and the sizes of the steps, of which the first `count` are
+    valid.
     """
     starts, sizes = interval
     forward = jnp.sign(sizes[0])
@@ -170,7 +172,7 @@ def step_position(
     Times outside of the run by round-off count as inside.
     """
     position = (t - t0) / dt
-    # Times have rounding errors proportional to the largest of them.
+    # Times have rounding errors that are proportional to the largest time.
     steps = num_steps + jnp.abs(t0 / dt)
     slack = jnp.maximum(1e-6, 8 * jnp.finfo(t.dtype).eps * steps)
     return position, (position >= -slack) & (position <= num_steps + slack)
@@ -198,7 +200,7 @@ def _evaluate(self: DenseInterpolation, t: FloatScalar) -> State:
 
 
 def require_collocation(method: AbstractMethod) -> None:
-    """Raise unless the method is a collocation method, so that u(t) exists."""
+    """Raise unless the method is a collocation method, as `interpolate` requires."""
     if method.stages > method.orders.C:
         raise ValueError(
             f"Dense output and `SaveAt(ts=...)` need a collocation method, one with "

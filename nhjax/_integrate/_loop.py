@@ -60,7 +60,7 @@ class Loop(eqx.Module):
         return carry, self._rows(carry, result, k)
 
     def _part(self, carry: AbstractCarry) -> FloatScalar:
-        """Return the part of the run that is done: all of it if it has ended."""
+        """Return the part of the run that is done, which is 1 if the run has ended."""
         part = self.stepper.progress(carry)
         return jnp.where(self.stepper.is_over(carry), jnp.ones_like(part), part)
 
@@ -99,7 +99,7 @@ class Loop(eqx.Module):
     def row_shapes(self, carry: AbstractCarry) -> Rows:
         """Return the shapes of the rows that an iteration saves.
 
-        No step is taken for this, because tracing a step is expensive.
+        This does not trace a step, because tracing a step is expensive.
         """
 
         def rows() -> Rows:
@@ -109,15 +109,15 @@ class Loop(eqx.Module):
         return jax.eval_shape(rows)
 
     def moving(self, carry: AbstractCarry) -> AbstractCarry:
-        """Return the same carry.
+        """Return the same carry, with tangents if the run is differentiated.
 
-        If the run is differentiated, the state also has tangents, which may be zero.
+        Only the state has tangents, which may be zero.
         """
         state = with_zero_tangents(carry.step_state.state, self.stepper)
         return eqx.tree_at(lambda x: x.step_state.state, carry, state)
 
     def no_rows(self, carry: AbstractCarry) -> Rows:
-        """Return the rows of an iteration after the end: zeros, which `write` drops."""
+        """Return the zeros that an iteration after the end saves, and `write` drops."""
         rows = jax.tree.map(
             lambda x: jnp.zeros(x.shape, x.dtype), self.row_shapes(carry)
         )
@@ -183,18 +183,19 @@ def count(num_steps: int | Int[Array, ""]) -> Any:
 
 
 class DirectAdjoint(AbstractAdjoint):
-    """Store the stages of every step: memory O(num_steps), the shortest time.
+    """Store the stages of every step: memory O(num_steps), the shortest run time.
 
     Forward mode (`jax.jvp`, `jax.jacfwd`, `jax.linearize`) and second derivatives
-    (`jax.hessian`, and either mode over either) work as well. If `num_steps` is an
-    array, only forward mode works.
+    (`jax.hessian`, and every other combination of the two modes) work as well. If
+    `num_steps` is an array, only forward mode works.
 
     !!! note
 
         This differs from the `DirectAdjoint` of diffrax, which nests scans and
         checkpoints up to a maximum number of steps, and which diffrax advises against.
-        In nhjax the number of steps, or with a controller a limit for it, is known, a
-        plain loop runs all steps, and this adjoint is the default.
+        In nhjax the number of steps, or with a controller a limit for it, is known
+        before the run. A plain loop therefore runs all steps, and this adjoint is the
+        default.
 
     !!! example
 
@@ -234,8 +235,8 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
         binomial scheme places checkpoints while the number of steps is not yet known,
         takes log(max_steps) checkpoints by default, and allows reverse mode only. In
         nhjax the number of steps, or with a controller a limit for it, is known, and
-        blocks have equal length. `checkpoints` is the number of blocks on one level,
-        and the default is faster and needs more memory.
+        blocks have equal length. `checkpoints` is the number of blocks on one level.
+        The default is faster than the default of diffrax, and needs more memory.
 
     **Arguments:**
 
@@ -318,7 +319,8 @@ def _block(advance: _Advance, length: int, stride: int, *, keep_all: bool) -> _A
 def _idle_after_the_end(loop: Loop) -> _Advance:
     """Return a variant of `advance` that is a no-op after the end of the run.
 
-    It is needed if the loop or its last block extends beyond the end of the run.
+    This variant is needed if the loop or its last block extends beyond the end of the
+    run.
     """
 
     def advance_or_idle(k, state):

@@ -16,23 +16,23 @@ from .._custom_types import FloatScalar
 class AbstractProgressMeter(eqx.Module):
     """A progress meter, which shows how many steps of a run are done.
 
-    Outside of transformations it is called between chunks of steps. Inside them, the
-    compiled time loop calls it on the host. For your own meter, write a subclass with
-    `update`.
+    Outside of transformations, `integrate` calls the meter between chunks of steps.
+    Inside transformations, the compiled time loop calls it on the host. For your own
+    meter, write a subclass with a method `update`.
     """
 
     @abstractmethod
     def update(self, done: int, total: int) -> None:
         """Show that `done` of `total` steps are complete.
 
-        The loop calls it on the host about a hundred times a run, and with
+        The loop calls this method on the host about a hundred times a run, and with
         done = total at the end.
         """
 
     def update_part(self, percent: int) -> None:
-        """Show that a part of the run is done, where the number of steps is not known.
+        """Show which part of the run is done, if the number of steps is not known.
 
-        The loop calls it when the percentage of the run's time has increased.
+        The loop calls this method when the percentage of the run's time has increased.
         """
         self.update(percent, 100)
 
@@ -82,7 +82,7 @@ class AbstractProgressMeter(eqx.Module):
 
 @jax.custom_batching.custom_vmap
 def _least(x: Int[Array, ""]) -> Int[Array, ""]:
-    """Return a number; in a batch, the least number of all members."""
+    """Return x, or in a batch the least x of all members."""
     return x
 
 
@@ -135,7 +135,7 @@ class TextProgressMeter(AbstractProgressMeter):
             print(f"{done} of {total} steps", flush=True)
 
     def update_part(self, percent: int) -> None:
-        """Print the percentage of the run that is done, about every tenth."""
+        """Print the percentage of the run that is done, after about each tenth."""
         if percent // 10 > self._printed.tenth or percent < 10 * self._printed.tenth:
             print(f"{percent} % of the run", flush=True)
         self._printed.tenth = percent // 10
@@ -171,7 +171,7 @@ class TqdmProgressMeter(AbstractProgressMeter):
         """Move the bar to `done` steps, and close it at the end of the run."""
         bar = self._open.bars.get(total)
         if bar is None:
-            # Steps before the bar opened must not count for its speed.
+            # Steps before the bar opened must not count for the speed that it shows.
             bar = self._open.bars[total] = tqdm.tqdm(
                 total=total,
                 initial=done,
@@ -193,7 +193,10 @@ class TqdmProgressMeter(AbstractProgressMeter):
 
 
 class _Printed:
-    """The tenth of a run that was printed last; all instances are equal."""
+    """The last tenth of a run that was printed.
+
+    All instances are equal, so that `jax.jit` does not recompile for each instance.
+    """
 
     def __init__(self):
         self.tenth = 0
@@ -208,8 +211,8 @@ class _Printed:
 class _Open:
     """The open bars of a meter, by the number of steps of their runs.
 
-    They are state on the host. All instances are equal and have the same hash, so that
-    `jax.jit` does not recompile a program for each of them.
+    The bars are state on the host. All instances are equal and have the same hash, so
+    that `jax.jit` does not recompile a program for each instance.
     """
 
     def __init__(self):

@@ -27,11 +27,11 @@ class ReversibleAdjoint(AbstractAdjoint):
     starts from the step of -h inverts the step.
 
     The retraced states differ from the states of the run by round-off. If the motion is
-    attracted to a set, like the motion of a sleigh, the set repels it in reversed time,
-    and the differences grow as fast as the motion decays. In that case prefer
-    `RecursiveCheckpointAdjoint`. This adjoint allows reverse mode and forward over
-    reverse mode only: `jax.jvp` needs one of the other two adjoints. It computes
-    gradients also if `num_steps` is an array.
+    attracted to a set, like the motion of a sleigh, the set repels the motion in
+    reversed time, and the differences grow as fast as the motion decays. In that case
+    prefer `RecursiveCheckpointAdjoint`. This adjoint allows reverse mode and forward
+    over reverse mode only: `jax.jvp` needs one of the other two adjoints. This adjoint
+    computes gradients also if `num_steps` is an array.
 
     !!! example
 
@@ -58,7 +58,8 @@ def _run(arguments: tuple[Loop, AbstractCarry]) -> tuple[AbstractCarry, Rows]:
 @_run.def_fwd
 def _run_fwd(perturbed, arguments):
     del perturbed
-    # Calling `_run` here would rule out forward mode over this reverse mode.
+    # `_run` has a custom rule for reverse mode, so that calling it here would rule out
+    # forward mode over this reverse mode.
     carry, rows = DirectAdjoint().run(*arguments)
     # The backward pass needs only the shapes of the buffers, and the log.
     shapes = jax.eval_shape(lambda: rows)
@@ -129,8 +130,9 @@ def _if_retraced(
 ) -> PyTree[Array]:
     """Return the gradient, or NaN if the run failed or could not be retraced.
 
-    A run counts as retraced if the state that was `reached` agrees with the `start`. If
-    all cotangents are zero, the gradient is zero in any case.
+    A run counts as retraced if the state that was `reached` agrees with the state at
+    the `start` of the run. If all cotangents are zero, the gradient is zero in any
+    case.
     """
     manifold = system.manifold_of(start.q)
     xi = manifold.local(manifold.compose(manifold.inverse(start.q), reached.q))

@@ -201,7 +201,8 @@ def _stepper(
     called = "y0.state" if isinstance(y0, Checkpoint) else "y0"
     check_multiplier(system, state, args, called)
     _check_saved(fn, t0, state, args)
-    # Arrays that the user's functions close over become leaves, for derivatives.
+    # Arrays that the user's functions close over become leaves of the system, so that
+    # the derivative rules reach them.
     u = system.fibre_coordinate(state)
     system = with_kept_functions(system, t0, state.q, u, args)
     # The type checker sees the property `plain` as a field.
@@ -268,8 +269,8 @@ class _Chunk(NamedTuple):
     - `checkpoint`: the checkpoint after the chunk; None for runs with events.
     - `system`: the system for the interpolation of records, if there are any.
     - `stats`: the statistics of the solution.
-    - `is_over`, `progress`: whether the run has ended, and the part of it that is done,
-        if its steps differ.
+    - `is_over`, `progress`: whether the run has ended, and the part of the run that is
+        done; both only if the steps differ in size.
     """
 
     carry: AbstractCarry
@@ -332,7 +333,7 @@ def _chunk(
     room: int,
     keeps_records: bool,
 ) -> _Chunk:
-    """Take the iterations of a `Span` of `numbers`, from the carry in `start`."""
+    """Take the iterations of the `Span` in `numbers`, from the carry in `start`."""
     round_off, carry, log = start
     span = Span(*numbers)
     grid = grid.of_length(span.num_steps)
@@ -345,9 +346,9 @@ def _chunk(
     loop = Loop(stepper, saving, NoProgressMeter())
 
     def steps(loop: Loop, carry: AbstractCarry, log: Any, start: Any, end: Any):
-        # The entries that are constant in the first step are constant in all steps.
-        # The matrices are traced to find these entries; the program does not compute
-        # them.
+        # Entries of the linearisation that are constant in the first step are constant
+        # in all steps. Its matrices are traced at the present state to find these
+        # entries, but the compiled program does not compute the matrices.
         plain, state = loop.stepper.plain, carry.step_state.state
         u = plain.system.fibre_coordinate(state)
         given = plain.system, plain.time(0), state.q, u, plain.args
@@ -459,14 +460,14 @@ def run_in_chunks(
     if not isinstance(grid, VariableGrid):
         steps = _sampled_steps(saveat, grid)
     keeps_records = saveat.dense or saveat.ts is not None
-    # The chunks get the number of steps with their spans.
+    # Each chunk gets the number of steps in its `Span`, so that the grid needs none.
     whole, grid = grid, grid.of_length(None)
     given = system, method, y0, grid, args, options, solver_options.stage_solver
     captured = captured_by(system, args, options)
     saves_start = jax.device_put(np.array(saveat.t0))
     start = _started(*given, saves_start, captured=captured)
     if not all(isinstance(x.dtype, np.dtype) for x in jax.tree.leaves(start.saved)):
-        # NumPy has no arrays of random keys.
+        # NumPy has no arrays of random keys, so that chunks cannot return this output.
         return run(system, method, y0, whole, args, options, saveat, solver_options)
 
     def chunk(carry: AbstractCarry, log: Any, span: Array) -> _Chunk:
@@ -606,9 +607,10 @@ def _all_steps(
     noise = _noise(loop.stepper, y0)
     if isinstance(y0, State) and not checkpoint:
         return as_cpu_kernel(steps, loop, None, y0, noise)
-    # A compiler that knows the start of a loop, such as zeros in its matrices, rounds
-    # differently in the loop. The barrier hides the start, so that a resumed run takes
-    # its steps by the same instructions.
+    # If the compiler knows values with which a loop starts, such as zeros in matrices,
+    # it generates other instructions for the loop, which round differently. The barrier
+    # hides the start values, so that this run and a run resumed from its checkpoint
+    # take their steps by the same instructions.
     started = as_cpu_kernel(_start, loop.stepper, y0, noise)
     given, rest = eqx.partition((loop, started), eqx.is_array)
     loop, started = eqx.combine(jax.lax.optimization_barrier(given), rest)
@@ -631,9 +633,9 @@ def _noise(
     """Measure the noise of the functions at a state; a checkpoint does not need it."""
     if isinstance(y0, Checkpoint):
         return None
-    # The noise has its own kernel: a loop over steps is compiled to faster code without
-    # another loop before it, and in a batch of runs from one state this kernel is not
-    # batched.
+    # The noise is measured in its own kernel for two reasons. A loop over steps is
+    # compiled to faster code if its kernel contains no other loop before it. In a batch
+    # of runs from one state, this kernel is not batched.
     plain = stepper.plain
     u = plain.system.fibre_coordinate(y0)
     given = plain.system, plain.time(0), y0.q, u, y0.multiplier, plain.args, plain.dt
@@ -685,7 +687,7 @@ def _padded_output(
         pieces.append(_one(saving.saved(t0, start, args)))
     last = _one(saving.saved(end.t, end.state, args)) if saveat.t1 else None
     if saveat.steps:
-        # The extra row of the buffers takes the end of the run.
+        # The extra row of the buffers receives the output at the end of the run.
         rows = jnp.arange(saving.num_saved + 1, dtype=jnp.int32)
         count = number // saveat.steps
         padded_rows = _infinite_unless(rows < count, saved)
@@ -708,7 +710,7 @@ def _padded_output(
 
 
 def _infinite_unless(valid: Bool[Array, " k"], saved: PyTree[Array]) -> PyTree[Array]:
-    """Return the entries that are valid, and infinite numbers for the others."""
+    """Return the entries, with infinity in place of entries that are not valid."""
 
     def fill(x: Array) -> Array:
         if not jnp.issubdtype(x.dtype, jnp.inexact):

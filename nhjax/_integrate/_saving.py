@@ -1,4 +1,4 @@
-"""The saved data of a run: the user's choice, and the buffers for it."""
+"""The saved data of a run: the options of the user, and the buffers of the data."""
 
 import reprlib
 from collections.abc import Callable, Sequence
@@ -33,8 +33,8 @@ class SaveAt(eqx.Module):
 
     - `t0`: save the initial state.
     - `t1`: save the final state.
-    - `ts`: save at these times, by the collocation polynomials; sorted in the
-        direction of time.
+    - `ts`: save at these times, by evaluating the collocation polynomials. The times
+        must be sorted in the direction of time.
     - `steps`: save after every step (True), or after every k-th step (an int k). With
         `t1=True` the final state is saved too, but not twice.
     - `dense`: save the collocation polynomials for `Solution.evaluate`.
@@ -43,12 +43,12 @@ class SaveAt(eqx.Module):
         for bit; see `nhjax.Checkpoint`.
 
     The output has one entry for each saved state; `nhjax.Solution` describes the
-    exceptions in runs with events or with steps that differ. With constant steps,
-    saving every k-th step (`steps=k`) and saving at given times (`ts`) need no buffer
-    of the length of the run. The samples at `ts` are computed after the run, from
-    the records of the steps that contain them. Between steps, the polynomials have
-    larger errors than the states at the steps, and the constraint holds to their
-    accuracy only, not to round-off.
+    exceptions in runs with events or with steps that differ in size. With constant
+    steps, saving every k-th step (`steps=k`) and saving at given times (`ts`) need no
+    buffer of the length of the run. The samples at `ts` are computed after the run,
+    from the records of the steps that contain them. Between the ends of steps, the
+    polynomials have larger errors than the states at the ends, and the constraints hold
+    only up to these larger errors, not to round-off.
 
     **Raises:** `ValueError` if no output is selected, a flag is not a bool, `steps` is
     not a bool or an int >= 1, `ts` is not a sorted vector, or `ts` and `steps` are

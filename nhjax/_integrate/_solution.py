@@ -28,7 +28,8 @@ class EventLog(eqx.Module):
     """The events of a run in order of time: the field `events` of a `Solution`.
 
     - `num`: the number of events.
-    - `ts`: their times, of shape (e,) for the e events that the run had room for.
+    - `ts`: the times of the events, of shape (e,), where e is the largest number of
+        events that the arguments `max_events` of all events allow.
     - `which`: for each entry, the index of the event in the argument `event`.
     - `before`, `after`: the states at the events before and after their resets, each a
         `State` with a leading axis of length e.
@@ -84,16 +85,16 @@ class Solution(eqx.Module):
         otherwise.
     - `checkpoint`: the `nhjax.Checkpoint` from which a later run continues bit for bit,
         with `SaveAt(checkpoint=True)`; None otherwise.
-    - `coordinates`: the names of the coordinates, if the system has names.
+    - `coordinates`: the names of the coordinates, or None if the system has no names.
     - `events`: an `nhjax.EventLog` of the events of the run if `event` was given; None
-        otherwise. With `event`, `stats` also has `num_events`, and `num_steps` is the
-        number of nodes that were reached. If an event ends the run, `t1` is its time,
-        and with constant steps all later entries of `ts` and `ys` repeat the time and
-        the state of the event.
+        otherwise. With `event`, `stats` also has `num_events`, and `num_steps` counts
+        only steps whose end was reached. If an event ends the run, `t1` is the time of
+        this event, and with constant steps all later entries of `ts` and `ys` repeat
+        the time and the state of the event.
 
-    If the steps differ, the output of a call outside of transformations has exactly the
-    steps that were taken. Under `jit` it has room for the largest number of steps, and
-    entries that are not used are infinite.
+    If the steps differ in size, the output of a call outside of transformations has
+    exactly the steps that were taken. Under `jit` the output has entries for the
+    largest possible number of steps, and entries that are not used are infinite.
 
     Under `vmap` every array has a leading axis for the members of the batch.
     """
@@ -121,12 +122,13 @@ class Solution(eqx.Module):
         propagated closure it is the polynomial through the stage multipliers Λ^i.
         At the ends of the steps the result is the state that `integrate` computed.
         Inside a step the error is O(h^s) in q, v and p. If no force depends on the
-        velocity, it is one order better in p and v.
+        velocity, the error in p and v is O(h^{s+1}).
 
         **Arguments:**
 
-        - `t`: a time between `t0` and `t1`; for many, use `jax.vmap(sol.evaluate)`. To
-            compile it, use `eqx.filter_jit(sol.evaluate)`.
+        - `t`: a time between `t0` and `t1`; for many times, use
+            `jax.vmap(sol.evaluate)`. To compile the evaluation, use
+            `eqx.filter_jit(sol.evaluate)`.
 
         **Returns:** a `State`.
 
@@ -166,20 +168,21 @@ class Solution(eqx.Module):
         `value`.
 
         The `stats` are variables such as `stats_num_steps`, and `result` is the name of
-        a member of `nhjax.RESULTS`. A run with events has `event_t` and `event_which`
-        along `event`. A batch has the first dimension `trajectory` (a batch of batches
-        `trajectory_0`, `trajectory_1`). If its members have different times, `time` has
-        no labels, and the variable `t` has the times.
+        a member of `nhjax.RESULTS`. A run with events has the variables `event_t` and
+        `event_which` with the dimension `event`. A batch has the first dimension
+        `trajectory` (a batch of batches `trajectory_0`, `trajectory_1`). If the members
+        of a batch have different times, `time` has no labels, and the variable `t` has
+        the times.
 
         **Arguments:**
 
         - `coordinates`: the names of the n coordinates. The default is the names in the
             system.
-        - `units`: units by the name of a variable, of `time`, or of a coordinate. Units
-            of variables and of `time` become the attribute `units`. Units of
-            coordinates become the labels `coordinate_unit`. Units of coordinates
-            divided by the unit of `time` become the labels `velocity_unit`. The unit of
-            a momentum does not follow from these units.
+        - `units`: a mapping from names to units, where a name is a variable, `time`, or
+            a coordinate. Units of variables and of `time` become the attribute `units`.
+            Units of coordinates become the labels `coordinate_unit`. Units of
+            coordinates divided by the unit of `time` become the labels `velocity_unit`.
+            The unit of a momentum does not follow from these units.
 
         **Returns:** an `xarray.Dataset`.
 
@@ -203,9 +206,9 @@ class Solution(eqx.Module):
     def failures(self) -> list[tuple[int | tuple[int, ...] | None, int, str]]:
         """List the runs that failed, each as (member, step, reason).
 
-        `step` is the index of the step that failed, and `reason` is the message of its
-        `RESULTS`. `member` is None for a solution without a batch, an index for a
-        batch, and a tuple of indices for a batch of batches.
+        `step` is the index of the step that failed, and `reason` is the message of the
+        run's member of `RESULTS`. `member` is None for a solution without a batch, an
+        index for a batch, and a tuple of indices for a batch of batches.
         """
         outcome = _outcome(self)
         if is_traced(*outcome):
@@ -313,7 +316,7 @@ def _failure_message(
         message += " With `throw=False` the part before the failure is returned."
         if "stage equations" in reason:
             message += (
-                " If the velocities grow without bound there, as in a fall, no `dt` is "
-                "small enough: end the run earlier with an `nhjax.Event`."
+                " If the velocities grow without bound there, no `dt` is small enough: "
+                "end the run earlier with an `nhjax.Event`."
             )
     return message

@@ -78,7 +78,7 @@ class Decision(NamedTuple):
 
     - `is_accepted`: whether the step is accepted. An unsolved step is never accepted.
     - `result`: `RESULTS.successful`, or the reason why the run fails.
-    - `size`: the size of the next step, or of the next attempt at this one.
+    - `size`: the size of the next step, or of the next attempt at the same step.
     - `memory`: the data of the controller after an accepted step.
     - `error`: the estimated error of the step in units of the tolerance; None for a
         controller without a tolerance.
@@ -138,7 +138,7 @@ class AbstractStepSizeController(eqx.Module):
     def given_size(
         self, context: StepContext, node: Int[Array, ""]
     ) -> FloatScalar | None:
-        """Return the size of a step if the user gives it, or None."""
+        """Return the size of a step if it is given by the user; otherwise None."""
         del context, node
         return None
 
@@ -172,7 +172,7 @@ def _decided(attempt: Attempt, size: FloatScalar, memory: Memory) -> Decision:
 class ConstantStepSize(AbstractStepSizeController):
     """Steps of the size `dt`, the default of `nhjax.integrate`.
 
-    With `t1` in place of `num_steps`, the last step is shorter if it has to be.
+    With `t1` in place of `num_steps`, the last step is shortened if it would pass `t1`.
 
     !!! example
 
@@ -198,7 +198,7 @@ class ConstantStepSize(AbstractStepSizeController):
     def resume(
         self, context: StepContext, size: FloatScalar, memory: Memory
     ) -> tuple[FloatScalar, Memory]:
-        """Return `dt`, which may differ from the `dt` of the run before."""
+        """Return `dt`, which may differ from the `dt` of the earlier run."""
         del size
         return _size_of_user(context), memory
 
@@ -250,8 +250,8 @@ class PIDController(AbstractStepSizeController):
     The error of a step is estimated from the forces at its stages; see
     `docs/step_sizes.md`. The error of each component of the state y is divided by
     atol + rtol |y|, and e_n is the root mean square of these quotients. A step is
-    accepted if e_n <= 1. Otherwise, or if its equations are not solved, the step is
-    repeated with a smaller size. The next size is
+    accepted if e_n <= 1. Otherwise, or if the equations of the step are not solved, the
+    step is repeated with a smaller size. The next size is
 
         h_{n+1} = h_n safety e_n^{-β1} e_{n-1}^{-β2} e_{n-2}^{-β3}
 
@@ -271,8 +271,8 @@ class PIDController(AbstractStepSizeController):
 
     - `rtol`, `atol`: the relative and the absolute tolerance. For a position on a
         group, |y| is the largest absolute value among the numbers of the element.
-    - `pcoeff`, `icoeff`, `dcoeff`: the coefficients of the controller. The default
-        depends on the last error only.
+    - `pcoeff`, `icoeff`, `dcoeff`: the coefficients of the controller. With the default
+        coefficients, the next size depends on the last error only.
     - `dtmin`, `dtmax`: the smallest and the largest size of a step, in units of time,
         both positive. A run that needs smaller steps fails. The last step of a run
         and steps to events may be smaller.
@@ -381,8 +381,9 @@ class PIDController(AbstractStepSizeController):
     def init(
         self, context: StepContext, t: FloatScalar, start: StepState
     ) -> tuple[FloatScalar, Memory, RESULTS]:
-        """Return `dt`, or a size for which the state changes by one percent."""
-        # Before the first step, two errors of one and unknown growth rates are assumed.
+        """Return `dt`, or without it a size that changes the state by one percent."""
+        # Before the first step there are no earlier errors and growth rates. The errors
+        # are taken as one, and the growth rates as infinite, which means unknown.
         one = jnp.ones((), t.dtype)
         memory = one, one, jnp.full(2, jnp.inf, t.dtype)
         if context.dt is not None:
@@ -535,11 +536,12 @@ class ReversibleController(AbstractStepSizeController):
 
     - `eps`: ε > 0, the size of a step times the density. Its unit is the unit of Q
         times the unit of time.
-    - `density`: Q(t, q, v, args) > 0, for Hamiltonian systems a function of
-        (t, q, p, args). It should not change if velocities change their signs. The
-        default is an estimate of the fastest frequency of the motion, from the
-        derivatives of the accelerations by positions and velocities; `eps` is then
-        about the angle that the fastest oscillation turns in a step.
+    - `density`: Q(t, q, v, args) > 0, for Hamiltonian systems a function of (t, q, p,
+        args). Q should not change if velocities change their signs. The default is an
+        estimate of the fastest angular frequency of the motion, from the derivatives of
+        the accelerations with respect to positions and velocities. With the default,
+        `eps` is about the phase angle by which the fastest oscillation advances in one
+        step.
 
     **Raises:** `ValueError` if `eps` is not positive. `integrate` raises a `ShapeError`
     if the density has another shape than (), and an `IntegrationError` where it is not
@@ -694,7 +696,7 @@ class ReversibleController(AbstractStepSizeController):
     def resume(
         self, context: StepContext, size: FloatScalar, memory: Memory
     ) -> tuple[FloatScalar, Memory]:
-        """Return the size after the node, in the direction of this run."""
+        """Return the size of the step after the node, in the direction of this run."""
         del size
         density, rate = memory
         return self._size(context, density, rate), memory
@@ -754,9 +756,9 @@ def fastest_frequency(
 ) -> FloatScalar:
     """Estimate the fastest angular frequency of the motion near a state.
 
-    With the acceleration a(q, u), which includes the constraints, the estimate is
-    (|∂a/∂q| + |∂a/∂u|²)^½. The norms are Frobenius norms in the metric of the kinetic
-    energy, which do not depend on the units of coordinates.
+    With the acceleration a(q, u), which includes the reactions of the constraints, the
+    estimate is (|∂a/∂q| + |∂a/∂u|²)^½. The norms are Frobenius norms in the metric of
+    the kinetic energy, which do not depend on the units of coordinates.
     """
     manifold = system.manifold_of(q)
 

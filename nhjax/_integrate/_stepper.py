@@ -2,9 +2,9 @@
 
 A stepper has its own loop carry: `init` creates it, `advance` performs one iteration,
 and `finish` returns the end of the run. The plain stepper takes one step of the method
-in each iteration. The steppers in `_variable`, for steps of different sizes, and in
-`_events`, for runs with events, are built on it. The loop and the adjoints work with
-any stepper.
+in each iteration. Two further steppers call the plain stepper: the stepper in
+`_variable` for steps of different sizes, and the stepper in `_events` for runs with
+events. The loop and the adjoints work with any stepper.
 """
 
 from abc import abstractmethod
@@ -95,7 +95,8 @@ class RunEnd(NamedTuple, Generic[Rows, Log]):
 
 
 C = TypeVar("C", bound=AbstractCarry)
-# The data that a reverse replay has about an iteration, besides its state.
+# The data that a reverse replay has about an iteration, besides the state from which
+# the iteration started.
 R = TypeVar("R")
 
 
@@ -130,7 +131,7 @@ class AbstractStepper(eqx.Module, Generic[C, R]):
     @property
     @abstractmethod
     def log_length(self) -> int:
-        """Return the number of entries for which the log has room, 0 without a log."""
+        """Return the number of entries of the log, or 0 for a stepper without a log."""
 
     @abstractmethod
     def num_filled(self, carry: C, i: Int[Array, ""]) -> Int[Array, ""]:
@@ -209,7 +210,8 @@ class AbstractReverseReplay(eqx.Module, Generic[C, R]):
     ) -> tuple[R, StepState]:
         """Find the data of iteration i and the state from which it started.
 
-        `following` and `step_state` belong to iteration i + 1.
+        `following` is the data of iteration i + 1, and `step_state` is the state from
+        which iteration i + 1 started.
         """
 
     @abstractmethod
@@ -286,7 +288,7 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
     def init(self, y0: State | Checkpoint, noise: FunctionNoise | None) -> PlainCarry:
         """Return the carry before the first step.
 
-        Its `result` is a failure if the run cannot start.
+        The field `result` of the carry is a failure if the run cannot start.
         """
         system, t, args = self.system, self.time(0), self.args
         checkpoint = y0 if isinstance(y0, Checkpoint) else None
@@ -305,7 +307,8 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
             RESULTS.inconsistent_start,
         )
         if y0.multiplier.shape[0] > 1:
-            # With a single constraint, the first step detects a singular matrix.
+            # The start is checked only with several constraints. With a single
+            # constraint, the first step itself detects a singular matrix.
             result = RESULTS.where(
                 (result == RESULTS.successful) & ~step_state.lin.determines_multipliers,
                 RESULTS.singular_stage_matrix,
@@ -486,10 +489,11 @@ def step_back(
     if _is_undone_by_negative_step(stepper, step_state):
         return back_from(step_state)
 
-    # Each iteration takes a step back from z to y and a step forward from y, and moves
-    # z by the difference between `step_state` and the end of the forward step. The two
-    # steps undo each other up to a small error, so this iteration converges far faster
-    # than an iteration that moves y.
+    # The unknown is the state z from which a step back starts. Each iteration takes
+    # this step from z to a state y, takes a step forward from y, and moves z by the
+    # difference between `step_state` and the end of the forward step. The two steps
+    # undo each other up to a small error, so this iteration converges far faster than
+    # an iteration with the unknown y.
     target = step_state.state
     manifold = stepper.system.manifold_of(target.q)
     propagated = stepper.method.carries_multiplier

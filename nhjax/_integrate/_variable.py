@@ -71,7 +71,7 @@ class NextStep(NamedTuple):
 
 
 class StepSizes(eqx.Module):
-    """How a run chooses the sizes of its steps, and where it ends.
+    """How a run chooses the sizes of its steps, and where the run ends.
 
     - `t1`: the end of the run, or None for a run of `num_steps` steps.
     - `max_steps`: the largest number of attempts at a step.
@@ -111,17 +111,19 @@ class StepSizes(eqx.Module):
         return Clock(t, compensation, size, memory, jnp.zeros((), bool)), result
 
     def next_step(self, clock: Clock, offset: FloatScalar | float = 0.0) -> NextStep:
-        """Return the next step, or the rest of it after an event at an `offset`.
+        """Return the next step, or the rest of the step after an event inside it.
 
-        A step that would pass the end of the run, or almost reach it, ends exactly
-        there.
+        `offset` is the time from the last node to this event. A step that would pass
+        the end of the run, or almost reach it, ends exactly at the end of the run.
         """
         t, h = clock.t + offset, clock.size - offset
         never = jnp.zeros((), bool)
         if self.t1 is None:
             return NextStep(t, h, ~never, never)
         rest = (self.t1 - t) - clock.compensation
-        # The round-off of the time may be larger than a small fraction of the step.
+        # A step almost reaches the end if the rest of the run exceeds the step by at
+        # most a slack. The slack includes the round-off of the time, which may be
+        # larger than a small fraction of the step.
         eps, size = float(jnp.finfo(t.dtype).eps), jnp.abs(h)
         largest = jnp.maximum(jnp.abs(self.t1), jnp.abs(t))
         slack = jnp.maximum(1e-9 * size, 4 * eps * largest)
@@ -401,12 +403,12 @@ class VariableReverseReplay(AbstractReverseReplay[VariableCarry, StepLogEntry]):
 
     @property
     def num_iterations(self) -> Int[Array, ""]:
-        """Return the number of accepted steps, which are all that must be undone."""
+        """Return the number of accepted steps, because only these must be undone."""
         return self.end.stats["num_steps"]
 
     @property
     def after_end(self) -> StepLogEntry:
-        """Return an entry, which `back` does not read."""
+        """Return an arbitrary entry of the log, because `back` does not read it."""
         return self._entry(jnp.zeros((), jnp.int32))
 
     def _entry(self, k: Int[Array, ""]) -> StepLogEntry:

@@ -1,8 +1,8 @@
 """The groups of the plane, SO(2) and SE(2), with angles that count turns.
 
 An angle is never wrapped to one turn when it is stored. Inside a step, a pose of SE(2)
-carries the cosine and sine of its angle (`FramedPose`), so that trigonometric functions
-are not evaluated again at every stage.
+also contains the cosine and sine of its angle (`FramedPose`), so that trigonometric
+functions are not evaluated again at every stage.
 """
 
 import math
@@ -295,7 +295,8 @@ class SE2(AbstractMotionGroup):
 
         It is (R(θ)ᵀ m - m, -m·J x) for μ = (m, σ) and τ(ξ) = (x, θ).
         """
-        # With the Cayley map this uses neither the angle nor trigonometric functions.
+        # With the Cayley map, this formula needs neither the angle nor trigonometric
+        # functions.
         cos_minus_1, sin = self.retraction.plane_rotation(xi[2])
         moment = jnp.sum(quarter_turn(self._translation(xi)) * mu[:2])
         turned = cos_minus_1 * mu[:2] - sin * quarter_turn(mu[:2])
@@ -375,7 +376,7 @@ def rotate(angle: Float[Array, ""], v: Float[Array, "2"]) -> Float[Array, "2"]:
 def wrapped_angle(
     angle: Float[Array, "1"], compensation: Float[Array, "1"]
 ) -> Float[Array, "1"]:
-    """Compute angle + compensation - 2πk for the integer k that brings it nearest to 0.
+    """Return angle + compensation - 2πk, with the integer k nearest to angle / 2π.
 
     The result is accurate to the round-off of one turn if k fits into half of the bits
     of the mantissa. The number 2πk is subtracted in parts that are short enough for

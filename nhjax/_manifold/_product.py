@@ -18,7 +18,7 @@ Vector = Float[Array, " n"]
 
 
 class ProductGroup(AbstractLieGroup):
-    """The direct product of Lie groups, its factors.
+    """The direct product of Lie groups, which are called its factors.
 
     An element is a tuple of elements, one for each factor. A vector of the Lie algebra
     or of its dual is the concatenation of the factors' vectors. A factor can itself be

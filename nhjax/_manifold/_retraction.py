@@ -214,7 +214,7 @@ def check_retraction(group: str, retraction: object) -> None:
 # accurate, because it divides its rounding errors by s.
 _SWITCH = 2.0
 
-# The first omitted term of the series is at most 2e-18, for c_0 at the switch.
+# The first omitted term of the series is at most 2e-18, for c_0 at s = `_SWITCH`.
 _NUM_TERMS = 11
 
 

@@ -5,8 +5,8 @@ Most of these coefficients are zero. Multiplying by the zeros costs less than sl
 vectors and concatenating them again: the derivative of a slice must be padded, and
 loops over concatenated parts branch. On SO(3) the bilinear maps reduce the time of a
 step by one quarter, and the time of its gradient by one third (measured). They reduce
-the compile times by the same fractions. A number that is not finite spreads to all
-entries of a product.
+the compile times by the same fractions. The products with zeros have one disadvantage:
+a number that is not finite makes all entries of the product NaN.
 """
 
 import equinox as eqx
@@ -230,9 +230,9 @@ class SO3(AbstractMotionGroup):
         The result has norm 1 up to rounding.
         """
         total, error = two_sum(q, multiply(q, self._increment(xi)) + compensation)
-        # One Newton step for the norm, applied to the sum and its error together. It
-        # removes the rounding error of the norm from the previous step, and does not
-        # change the rotation.
+        # A Newton step for the norm is applied to the sum and its error together. The
+        # Newton step removes the rounding error of the norm from the previous step, and
+        # does not change the rotation.
         correction = 0.5 * (1 - dot(total, total)) - dot(total, error)
         return total, error + correction * total
 

@@ -45,15 +45,17 @@ _STATEMENTS = {
     "H3": "H3 (a_sj = b_j, last stage at t_{k+1})",
 }
 
-# R_A(∞) of a user's tableau is a ratio of sums of products of float64 coefficients. For
-# Lobatto IIIA with s = 12, rounding the coefficients changes it by less than 1e-10.
+# The tolerance of conditions on R_A(∞). For a user's tableau, R_A(∞) is a ratio of sums
+# of products of float64 coefficients. For Lobatto IIIA with s = 12, rounding the
+# coefficients changes R_A(∞) by less than 1e-10.
 _UNIT_TOLERANCE = 1e-9
 
-# At s = 32, 60 digits still resolve every order condition, the rounded coefficients
-# satisfy the stage conditions to 2e-16, and runs converge to round-off. Two things are
-# worse than with fewer stages. The defect of the multiplier is six times as large as at
-# s = 16, where it is round-off. The checks of a tableau take 5 s (s = 20: 0.8 s;
-# s = 100: minutes), because their cost grows at least as s^4.
+# The largest number of stages. At s = 32, 60 digits still resolve every order
+# condition, the rounded coefficients satisfy the stage conditions to 2e-16, and runs
+# converge to round-off. Two things are worse than with fewer stages. The defect of the
+# multiplier is six times as large as at s = 16, where it is round-off. The checks of a
+# tableau take 5 s (s = 20: 0.8 s; s = 100: minutes), because their cost grows at least
+# as s^4.
 MAX_STAGES = 32
 
 
@@ -61,7 +63,7 @@ MAX_STAGES = 32
 class ClosureWeights:
     """The weights that map a closure's unknowns to the multipliers of a step.
 
-    All are read-only float64 arrays. Instances compare by identity.
+    All fields are read-only float64 arrays. Instances compare by identity.
 
     **Fields:**
 
@@ -129,8 +131,8 @@ class AbstractMethod(eqx.Module):
     def order(self) -> int:
         """Return the order of q and p in systems without constraints.
 
-        Up to order 8 it follows from the order conditions of the pair (a, â). Above
-        order 8 it is min(p, 2r + 2) of B(p) and D(r), which agrees with measurements.
+        Up to 8, the order follows from the order conditions of the pair (a, â). Above
+        8, the order is min(p, 2r + 2) of B(p) and D(r), which agrees with measurements.
         """
         return _order_conditions.order(self._tableau())
 
@@ -138,10 +140,10 @@ class AbstractMethod(eqx.Module):
     def constrained_order(self) -> int:
         """Return the order of q and p in systems with constraints.
 
-        It is min(p, 2r + 2) of B(p) and D(r), or the order without constraints if that
-        is less. For collocation on nodes with both ends, such as Lobatto's, the page
-        on closures proves that the order is at least 2r + 2; runs of many tableaux
-        show that it is not higher.
+        It is min(p, 2r + 2) of B(p) and D(r), or the order without constraints if this
+        order is smaller. For collocation on nodes that include 0 and 1, such as
+        Lobatto's, the page on closures proves that the order is at least 2r + 2; runs
+        of many tableaux show that it is not higher.
 
         **Raises:** `ValueError`, as `require_constraint_hypotheses` does.
         """
@@ -167,12 +169,12 @@ class AbstractMethod(eqx.Module):
     def multiplier_order(self) -> int:
         """Return the order of convergence of the multiplier that a solution reports.
 
-        With `closure="propagated"` it is the smaller of q in C(q) and Q in CĈ(Q), less
-        one if R_A(∞) = 1, then rounded up to an even number if the method is symmetric,
-        and at most `constrained_order`. Runs of many tableaux show this. (The paper's
-        theorem on global convergence has q instead; q and Q are equal for Lobatto nodes
-        only.) With the other closures the multiplier is the continuous multiplier,
-        which has the order of the state.
+        With `closure="propagated"` this order is the smaller of q in C(q) and Q in
+        CĈ(Q), minus one if R_A(∞) = 1, then rounded up to an even number if the method
+        is symmetric, and at most `constrained_order`. Runs of many tableaux show this
+        rule. (The paper's theorem on global convergence has q in place of the smaller
+        of q and Q; they are equal for Lobatto nodes only.) With the other closures the
+        multiplier is the continuous multiplier, which has the order of the state.
 
         **Raises:** `ValueError`, as `require_constraint_hypotheses` does.
         """

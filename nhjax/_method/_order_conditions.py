@@ -1,9 +1,9 @@
 """Order conditions, hypotheses, symmetry and stability of a tableau.
 
-The simplifying assumptions are due to Butcher (Hairer, Lubich, Wanner, "Geometric
-Numerical Integration", II.1), and, for the mixed one, to L. Jay ("Symplectic
-partitioned Runge-Kutta methods for constrained Hamiltonian systems", SIAM J. Numer.
-Anal. 33, 1996):
+The simplifying assumptions B, C and D are due to Butcher (Hairer, Lubich, Wanner,
+"Geometric Numerical Integration", II.1). The mixed assumption CĈ is due to L. Jay
+("Symplectic partitioned Runge-Kutta methods for constrained Hamiltonian systems", SIAM
+J. Numer. Anal. 33, 1996):
 
     B(p):  Σ_i b_i c_i^{k-1} = 1/k                               k = 1..p
     C(q):  Σ_j a_ij c_j^{k-1} = c_i^k / k                        k = 1..q
@@ -34,8 +34,8 @@ from ._tableau import context, Matrix, Number, Tableau
 class SimplifyingAssumptions(NamedTuple):
     """The largest p, q, r and Q for which B(p), C(q), D(r) and CĈ(Q) hold.
 
-    `mixed` is Q. It is 1, an empty assumption, if the condition fails for k = 2. The
-    search ends at 2s, the largest order of a quadrature with s nodes.
+    `mixed` is Q. If the condition fails for k = 2, Q is 1, because CĈ(1) is an empty
+    assumption. The search stops at 2s, the largest order of a quadrature with s nodes.
     """
 
     B: int
@@ -45,11 +45,11 @@ class SimplifyingAssumptions(NamedTuple):
 
 
 class Hypotheses(NamedTuple):
-    """Which of the hypotheses of systems with constraints hold for (a, b).
+    """The hypotheses for systems with constraints: whether each holds for (a, b).
 
-    - `H1`: a_1j = 0, the first stage is the state at t_k.
+    - `H1`: a_1j = 0, so that the first stage is the state at t_k.
     - `H2`: the submatrix (a_ij), i, j >= 2, is invertible.
-    - `H3`: a_sj = b_j, the last stage is the state at t_{k+1}.
+    - `H3`: a_sj = b_j, so that the last stage is the state at t_{k+1}.
     """
 
     H1: bool

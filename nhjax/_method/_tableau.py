@@ -47,7 +47,8 @@ def context() -> Any:
     It is independent of a user's `mpmath.mp.dps`. With 60 digits, order conditions can
     be checked to 1e-40 with 20 digits to spare.
     """
-    # `import nhjax` does not need mpmath, which would be a sixth of its time.
+    # mpmath is imported here, because `import nhjax` does not need it, and importing it
+    # would take a sixth of the time of `import nhjax`.
     import mpmath
 
     made = mpmath.MPContext()

@@ -160,7 +160,8 @@ def _check_velocity(body: Any, frame: Any, solved: dict[Any, Any]) -> None:
 
     In Kane's method, a model may set the velocity of the point where a wheel touches
     the ground to zero, although the contact moves. The energy is then correct only for
-    motions that satisfy the constraint, and its Lagrange equations are wrong.
+    motions that satisfy the constraint, and Lagrange equations derived from this energy
+    are wrong.
     """
     centre = body.masscenter
     for point in _connected_points(centre)[1:]:

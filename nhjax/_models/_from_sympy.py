@@ -537,7 +537,7 @@ def _by_name(where: str, given: Mapping[Any, Any]) -> dict[str, Any]:
 def parameter_defaults(
     parameters: Mapping[Any, Any], known: tuple[str, ...]
 ) -> dict[str, Array]:
-    """Return the values of parameters by name, as arrays for both precisions."""
+    """Return the values of parameters by name, as arrays."""
     if not isinstance(parameters, Mapping):
         raise TypeError(
             "from_sympy: `parameters` must be a dictionary of values by symbol or "

@@ -2,9 +2,10 @@
 
 For matrices of a few rows, calling a library of linear algebra is too expensive. Inside
 a time loop the calls cost more than the arithmetic. The calls cannot be compiled into
-one kernel with the operations around them, and a batch of calls runs one by one.
-`small_einsum` and `inverse` consist of elementary operations up to a limit of size;
-`with_small_products` rewrites the products in the functions of a user.
+one kernel with the operations around them, and a batch of calls runs one by one. Up to
+a limit of size, `small_einsum` and `inverse` consist of elementary operations.
+`with_small_products` replaces the products in the functions of a user by
+`small_einsum`.
 """
 
 import math
@@ -22,15 +23,17 @@ from .._compile import LONGEST_SUM, small_product
 from ..lanes import LARGEST_REDUCTION
 
 
-# A library computes larger products, and sums longer than `LONGEST_SUM`, so that the
-# program stays short. From about 10⁵ terms on the library was faster (measured).
+# A library computes products with more terms than this, so that the program stays
+# short. It also computes products with more than `LARGEST_REDUCTION` terms if each sum
+# is longer than `LONGEST_SUM`. From about 10⁵ terms on the library was faster
+# (measured).
 LARGEST_PRODUCT = 2**15
-# Matrices with more rows are inverted by a library.
+# Matrices with more rows than this are inverted by a library.
 LARGEST = 50
 
 
 def small_einsum(subscripts: str, a: Array, b: Array) -> Array:
-    """Compute `jnp.einsum(subscripts, a, b)`, by single products and sums if small.
+    """Compute `jnp.einsum(subscripts, a, b)`; small products are elementary operations.
 
     Each index that is summed must be in both operands.
     """
@@ -49,7 +52,7 @@ def small_einsum(subscripts: str, a: Array, b: Array) -> Array:
 def _small_product(
     first: str, second: str, result: str, a: tuple[int, ...], b: tuple[int, ...]
 ) -> dict[str, Any] | None:
-    """Return the parameters of a product of these shapes, or None if it is large."""
+    """Return the parameters for `small_product`, or None if the product is large."""
     lengths = dict(zip(first, a, strict=True))
     for index, length in zip(second, b, strict=True):
         if lengths.setdefault(index, length) != length:
@@ -81,11 +84,11 @@ def _contract_axes(dimension_numbers, a: Array, b: Array) -> Array:
 def inverse(matrix: Float[Array, "n *n"]) -> Float[Array, "n *n"]:
     """Invert a small matrix; the result is not finite if there is no inverse.
 
-    An array with one axis is the diagonal of a diagonal matrix. Its result has one axis
-    too.
+    An array with one axis is the diagonal of a diagonal matrix. Then the result is the
+    diagonal of the inverse.
     """
     size = matrix.shape[0]
-    # Systems with one constraint, and so a matrix of size 1, are the most common.
+    # Systems with one constraint are the most common. Their matrix has size 1.
     if matrix.ndim == 1 or size == 1:
         return 1 / matrix
     if size == 0:
@@ -108,7 +111,8 @@ def _inverse_jvp(primals, tangents):
 def compiled_once_inverse(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
     """Invert a matrix by Gauss-Jordan elimination in place, with row pivoting.
 
-    The name lets `nhjax.lanes` compile it once for all matrices of the same size.
+    Because of its name, `nhjax.lanes` compiles this function once for all matrices of
+    the same size.
     """
     rows = jnp.arange(matrix.shape[0])
 
@@ -173,18 +177,18 @@ def mapped(
 
 
 def inverses(matrices: Float[Array, "k n n"]) -> Float[Array, "k n n"]:
-    """Invert some small matrices, one after the other."""
+    """Invert a stack of small matrices, one after the other."""
     return mapped(inverse, matrices)
 
 
 def inverse_by_blocks(matrix: Float[Array, "s n s n"]) -> Float[Array, "s n s n"]:
     """Invert a matrix of s x s blocks by Gauss-Jordan elimination of blocks.
 
-    Rows are exchanged only within a block. This is stable if the diagonal blocks
-    dominate, or if the matrix is close to a Kronecker product A ⊗ C with n rows in C,
-    and eliminating A without row exchanges is stable. The elimination is a loop over
-    blocks, so that the program is short and the matrix may be larger than for
-    `inverse`.
+    Rows are exchanged only within a block. The elimination is stable if the diagonal
+    blocks dominate. It is also stable if the matrix is close to a Kronecker product
+    A ⊗ C with n rows in C, and eliminating A without row exchanges is stable. The
+    elimination is a loop over blocks, so that the program is short and the matrix may
+    be larger than for `inverse`.
     """
     s = matrix.shape[0]
 
@@ -258,8 +262,8 @@ def solve_by_rows(
 
 
 def repeated(count: int | Array, body: Callable[[Array, Any], Any], carry: Any) -> Any:
-    # Unlike a `fori_loop`, this loop has no derivative in reverse mode, and our
-    # compiler never unrolls it.
+    # Unlike a `fori_loop`, this loop has no derivative in reverse mode, and
+    # `nhjax.lanes` never unrolls it.
     def step(given):
         k, carry = given
         return k + 1, body(k, carry)

@@ -36,9 +36,9 @@ def largest_column(*arrays: Float[Array, "_ n"]) -> tuple[FloatScalar, Int[Array
     """Compute max |x| over matrices of n columns, and the column that contains it.
 
     The last bits of each bit pattern are replaced by the index of its column, so that
-    one maximum finds both; the value loses these bits. A search for the column after
-    the maximum took a tenth of the time of a step. If some numbers are NaN, the result
-    is a column that contains NaN.
+    one maximum finds the value and the column; the value loses these bits. A search for
+    the column after the maximum took a tenth of the time of a step. If some numbers are
+    NaN, the result is a column that contains NaN.
     """
     columns = arrays[0].shape[1]
     mask = (1 << max(columns - 1, 0).bit_length()) - 1
@@ -81,12 +81,12 @@ def two_sum(
 
 
 def uneven_perturbations(q: PyTree[Array]) -> PyTree[Array]:
-    """Return a perturbation of each number in q, between half its size and its size.
+    """Return a perturbation of each number in q, of half the number's size or more.
 
-    The perturbations differ and have both signs, so that they hardly cancel in
-    differences and sums of a few numbers. A relative perturbation is 1 - x/2 or its
-    negative; the x are the fractional parts of multiples of the golden ratio, which are
-    spread evenly over [0, 1).
+    No perturbation is larger than its number. The perturbations differ and have both
+    signs, so that they hardly cancel in differences and sums of a few numbers. Relative
+    perturbations are ±(1 - x/2). The x are the fractional parts of multiples of the
+    golden ratio, which are spread evenly over [0, 1).
     """
     numbers, unravel = ravel_pytree(q)
     k = np.arange(numbers.size)
@@ -97,17 +97,18 @@ def uneven_perturbations(q: PyTree[Array]) -> PyTree[Array]:
 # Values of up to this many standard deviations of noise may be round-off.
 NOISE_DEVIATIONS = 100
 
-# The points of one difference lie on a ray that starts at the point of interest.
+# The number of points from which differences are computed. The points lie on a ray that
+# starts at the point of interest.
 _NUM_POINTS = 6
-# Distances of neighbouring points, as powers of the unit round-off, smallest first. For
-# a smooth function that changes within a length L, at least one distance must lie
-# between 1e-3 and 0.3 of L: at smaller ones round-off hides that the function is
-# smooth, and at larger ones it does not look smooth.
+# The distances of neighbouring points are the unit round-off raised to these powers.
+# For a smooth function that changes within a length L, at least one distance must lie
+# between 1e-3 and 0.3 of L: at smaller distances round-off hides that the function is
+# smooth, and at larger distances the function does not look smooth.
 _DISTANCES = 0.85, 0.73, 0.615, 0.5
-# Two rays for each distance, since one difference may be small by chance.
+# For each distance there are two rays, since one difference may be small by chance.
 _NUM_RAYS = 2
 # A function counts as smooth if its fifth difference is less than this fraction of its
-# third.
+# third difference.
 _SMOOTH = 1 / 30
 
 
@@ -121,17 +122,17 @@ def measured_noise(
     Values at points that are close to each other differ by a smooth change and by
     round-off. A difference of fifth order removes the smooth change and leaves the
     round-off (Moré and Wild, Estimating computational noise, SIAM J. Sci. Comput. 33,
-    2011). Such a measurement includes the effect of constants in the function, of
-    cancellation, and of the rounding of arguments, magnified by steep functions.
+    2011). Such a measurement includes the effects of constants in the function and of
+    cancellation, and the round-off of arguments, which steep functions magnify.
 
-    Very small displacements may be lost next to a constant in the function, and values
-    at larger displacements may differ by more than round-off. Therefore the function is
-    measured at four distances (5e-14 to 1e-8 in double precision). The search stops at
-    the first distance at which the differences decrease with their order, as for a
-    smooth function. The result is the largest difference at shorter distances, or at
-    the shortest distance if the search stops there. The points lie on rays from the
-    point of interest, so that a kink or a jump at this point, such as friction at rest,
-    is not mistaken for round-off.
+    Very small displacements may be lost in a sum with a constant in the function, and
+    values at larger displacements may differ by more than round-off. Therefore the
+    function is measured at four distances (5e-14 to 1e-8 in double precision). The
+    search stops at the first distance at which the fifth difference is much smaller
+    than the third difference, as for a smooth function. The result is the largest fifth
+    difference at shorter distances, or at the shortest distance if the search stops
+    there. The points lie on rays from the point of interest, so that a kink or a jump
+    at this point, such as friction at rest, is not mistaken for round-off.
 
     **Arguments:**
 
@@ -158,7 +159,8 @@ def measured_noise(
     rays = jnp.asarray(rays.reshape(-1, size), dtype)
     lengths = [math.prod(x.shape) for x in jax.tree.leaves(like)]
 
-    # A `while` loop contains the function once; XLA may unroll a short `scan`.
+    # The program of a `while` loop contains the function only once. XLA may unroll a
+    # short `scan`.
     def on_ray(_, ray):
         def add(carry):
             k, total = carry
@@ -184,6 +186,6 @@ def measured_noise(
 
 
 def _weights(order: int) -> np.ndarray:
-    """Return the weights of a difference that keeps the standard deviation of noise."""
+    """Return the weights of a difference, scaled to preserve the deviation of noise."""
     weights = np.array([(-1.0) ** k * math.comb(order, k) for k in range(order + 1)])
     return weights / np.linalg.norm(weights)

@@ -1,9 +1,10 @@
 """Derivatives of values that are computed by iterations or not defined everywhere.
 
-`AbstractImplicitFunction` has the rule for the derivatives of all steps: they follow
-from the solution by the implicit function theorem, not from the iterations. The rest of
-the file has the linear and nonlinear solves that such functions use, and the helpers
-that change the tangents of trees: to zero, to NaN, or to tangents that JAX can see.
+`AbstractImplicitFunction` has the rule for the derivatives of all steps: derivatives
+follow from the solution by the implicit function theorem, not from the iterations. The
+rest of the file contains the linear and nonlinear solves that such functions use, and
+helpers that change the tangents of trees: to zero, to NaN, or from a symbolic zero to
+an array of zeros.
 """
 
 from abc import abstractmethod
@@ -44,9 +45,9 @@ Solution = TypeVar("Solution")
 class AbstractImplicitFunction(eqx.Module, Generic[Arguments, Solution]):
     """A function whose value solves equations, with derivatives from these equations.
 
-    Call it with its arguments, a tree. The function is differentiable with respect to
-    its arguments, but not with respect to its own fields. JAX never differentiates
-    `solve`: derivatives of every order come from `tangent`.
+    Call an instance with one tree, its arguments. The function is differentiable with
+    respect to its arguments, but not with respect to its own fields. JAX never
+    differentiates `solve`: derivatives of every order come from `tangent`.
 
     - `programs`: a cache of traced programs; None if the function is part of a larger
         program. With a cache, the derivative rule reuses the traced program of `solve`
@@ -72,10 +73,10 @@ class AbstractImplicitFunction(eqx.Module, Generic[Arguments, Solution]):
     def __call__(self, arguments: Arguments) -> Solution:
         """Compute the solution; it can be differentiated with respect to `arguments`.
 
-        With a cache, the function is one primitive of JAX. When JAX splits a scan into
-        a known and a linear part, it drops the derivative rules of functions, but not
-        the rules of primitives. Without its rule, a step could be differentiated in
-        reverse mode only once.
+        If `programs` is a cache, the function is one primitive of JAX. When JAX splits
+        a scan into a known and a linear part, it drops the derivative rules of
+        functions, but not the rules of primitives. Without its rule, a step could be
+        differentiated in reverse mode only once.
         """
         if self.programs is None:
             return _solution(arguments, self)
@@ -132,18 +133,18 @@ def solve_contraction(
 ) -> X:
     """Solve x = G x + b for a linear contraction G; x is NaN if G does not contract.
 
-    Both x and the solution of the transposed equation are sums of the Neumann series.
-    The sum ends when its terms are below 256 units of round-off. If G contracts by a
-    factor ρ, the remaining terms sum up to ρ / (1 - ρ) times that bound.
+    Both x and the solution of the transposed equation are sums of a Neumann series. The
+    sum ends when its terms are below 256 units of round-off. If G contracts by a factor
+    ρ, the sum of the remaining terms is at most ρ / (1 - ρ) times this bound.
 
     If x -> G x + b is a linearised simplified Newton iteration, the sum is iterative
-    refinement with the factors of that iteration. It takes about as many evaluations as
-    the nonlinear iteration did. Derivatives of every order follow from the equation,
-    not from the iterations.
+    refinement with the factors of that iteration. The sum takes about as many
+    evaluations as the nonlinear iteration took. Derivatives of every order follow from
+    the equation, not from the iterations.
 
-    The size of a term is its largest entry, divided by the `units` of the leaves of x.
-    The unknowns of the transposed equation have the inverse units, so that a product of
-    both has no unit.
+    The size of a term is its largest entry, after each leaf is divided by its entry in
+    `units`. The unknowns of the transposed equation have the inverse units, so that the
+    product of x and these unknowns has no unit.
     """
     given, treedef = jax.tree.flatten(b)
 
@@ -200,10 +201,11 @@ def _minus(xs: list[Array], ys: list[Array]) -> list[Array]:
 
 
 def _depending_on_all(xs: list[Array]) -> list[Array]:
-    """Return the same arrays, such that each of them depends on all of them.
+    """Return the same arrays, changed so that each array depends on all arrays.
 
-    Then differentiation treats either all or none of them as constants. JAX cannot
-    transpose a linear equation if it treats only a part of b as constant.
+    Differentiation then treats either all or none of the arrays as constants. JAX
+    cannot transpose a linear equation if only a part of its right-hand side is treated
+    as constant.
     """
     zero = 0 * sum(x.reshape(-1)[0] for x in xs)
     return [x + zero for x in xs]
@@ -227,15 +229,15 @@ def root(
 
     - `scale`: the size to which the round-off of x is proportional. It is larger than
         the size of x0 if x is an increment to a larger number.
-    - `judged`: selects the part of an increment that must be small to end the
-        iteration. Multipliers have other units and follow from the rest, so they can be
-        left out.
-    - `solve`: called as `solve(jacobian, b)` for the increments and for the derivative
-        of the root; a dense solve by default.
+    - `judged`: a function that selects the part of an increment that must be small to
+        end the iteration. Multipliers can be left out, because they have other units
+        and follow from the other unknowns.
+    - `solve`: a function that is called as `solve(jacobian, b)` for the increments and
+        for the derivative of the root; a dense solve by default.
     - `path`: a function of (θ, x) that returns residuals. It has the root `x0` at
-        θ = 0, and is equal to `residual` at θ = 1. If Newton's method does not find a
-        root, the root of `path` is followed from θ = 0 to θ = 1. Newton's method may
-        cycle where the residual has kinks.
+        θ = 0, and is equal to `residual` at θ = 1. Newton's method may cycle where the
+        residual has kinks. If Newton's method does not find a root, the root of `path`
+        is followed from θ = 0 to θ = 1.
     - `max_iterations`: the largest number of iterations.
     """
     flat, unravel = ravel_pytree(x0)
@@ -260,7 +262,7 @@ def root(
             def residual(z):
                 return ravel_pytree(path(part, unravel(z)))[0], None
 
-            # Shorter increments cross a kink where whole increments would cycle.
+            # Increments are shortened, because whole increments may cycle at a kink.
             dx, _ = dense_increment(residual, x, solve)
             shorter = x[None] + jnp.outer(0.5 ** jnp.arange(5, dtype=x.dtype), dx)
             sizes = jax.vmap(lambda z: max_norm(residual(z)[0]))(shorter)
@@ -295,15 +297,16 @@ def root(
 
 
 class ClosureConverted(eqx.Module):
-    """A traced function whose closed-over arrays are leaves.
+    """A traced function as a tree, whose leaves are the arrays that it closes over.
 
-    A custom rule of derivatives differentiates only with respect to its arguments. If
-    an argument is an instance of this class, derivatives reach the arrays that the
-    function closes over. `equinox.filter_closure_convert` does the same, but it refuses
-    arrays whose sharding differs inside and outside of `jax.shard_map`.
+    A function with a custom rule of derivatives is differentiated only with respect to
+    its arguments. If an argument is an instance of this class, it is also
+    differentiated with respect to the arrays that the instance closes over.
+    `equinox.filter_closure_convert` does the same, but it refuses arrays whose sharding
+    differs inside and outside of `jax.shard_map`.
 
-    Call it with trees of the structure of `example`. Leaves that are not arrays keep
-    the values that they have in `example`.
+    Call an instance with trees of the structure of `example`. Leaves that are not
+    arrays always have the values that they have in `example`.
     """
 
     consts: list[Array]
@@ -338,8 +341,8 @@ def with_zero_tangents(tree: X, parameters: PyTree[Any]) -> X:
     """Return the same tree, with tangents of zeros if any parameter has a tangent.
 
     JAX traces the body of a loop again if a part of the carry has no tangent at first,
-    but has one after an iteration. If the initial carry has tangents of zeros, JAX
-    traces the body once.
+    but has a tangent after an iteration. If the initial carry has tangents of zeros,
+    JAX traces the body once.
     """
     parameters = jax.tree.leaves(eqx.filter(parameters, eqx.is_inexact_array))
     inexact, others = eqx.partition(tree, eqx.is_inexact_array)
@@ -365,8 +368,8 @@ def _with_zero_tangents_jvp(primals, tangents):
     given = jax.tree.leaves((rates, others))
     if not given:
         return leaves, rates
-    # This zero is an empty sum of a tangent. JAX interprets zeros that depend on no
-    # tangent as the absence of a tangent.
+    # This zero is a sum over no entries of a tangent. JAX interprets zeros that depend
+    # on no tangent as the absence of a tangent.
     zero = jnp.sum(jnp.ravel(given[0])[:0])
     return leaves, [
         jnp.zeros_like(x) + zero.astype(x.dtype) if rate is None else rate
@@ -375,7 +378,7 @@ def _with_zero_tangents_jvp(primals, tangents):
 
 
 def stop_gradient(tree: T) -> T:
-    """Stop derivatives through the arrays of a tree, and keep its other leaves.
+    """Stop derivatives through the arrays of a tree; return other leaves unchanged.
 
     `jax.lax.stop_gradient` refuses leaves that are not arrays.
     """
@@ -390,12 +393,12 @@ def tree_where(ok: BoolScalar, tree: X, other: X) -> X:
 
 
 def zero_unless(ok: BoolScalar, tree: X) -> X:
-    """Replace the numbers of a tree by zeros where `ok` is false, and keep None."""
+    """Replace the numbers of a tree by zeros where `ok` is false; None stays None."""
     return jax.tree.map(lambda x: jnp.where(ok, x, jnp.zeros_like(x)), tree)
 
 
 def nan_unless(ok: BoolScalar, tree: X) -> X:
-    """Replace the numbers of a tree by NaN where `ok` is false, and keep None."""
+    """Replace the numbers of a tree by NaN where `ok` is false; None stays None."""
     return jax.tree.map(lambda x: jnp.where(ok, x, jnp.nan), tree)
 
 
@@ -440,8 +443,9 @@ def _value_jvp(primals, tangents):
 def nan_tangent_unless(ok: BoolScalar, dx: Array) -> Array:
     """Return a tangent, but NaN where `ok` is false and the tangent is not zero.
 
-    This function is not linear. JAX must treat it as linear to transpose it, so it is
-    written as a linear solve, whose transpose does the same to a cotangent.
+    This function is not linear, but JAX can only transpose linear functions. Therefore
+    it is written as a linear solve. The transpose of this solve does the same to a
+    cotangent.
     """
 
     def solve(_, b):

@@ -16,8 +16,9 @@ Aux = TypeVar("Aux")
 
 
 # If an iteration may converge slowly, increments that have stopped falling are treated
-# as noise up to this many units of round-off. Larger increments can also come from a
-# slow iteration that spirals towards the solution.
+# as noise up to this many units of round-off. Larger increments are not treated as
+# noise, because they can also come from a slow iteration that spirals towards the
+# solution.
 NOISE_UNITS = 400
 # When an increment fails to fall for the first time, this many units of round-off are
 # treated as noise. Each further failure multiplies this level by one of the two factors
@@ -38,8 +39,8 @@ _SLOW = 100
 class UpdateNorms(NamedTuple):
     """The sizes of an increment and of the iterate that it leads to, in the same unit.
 
-    `noise`, if it is known, is the change of the iterate per relative change of the
-    data of the problem. Rounding changes the data by a few units of round-off.
+    `noise` is the change of the iterate per relative change of the data of the problem,
+    or None if this is not known. Rounding changes the data by a few units of round-off.
     """
 
     increment: FloatScalar
@@ -79,7 +80,7 @@ class _Progress(NamedTuple):
     """The progress of an iteration so far.
 
     - `first`, `smallest`: the first and the smallest increment.
-    - `believed`: the size of increments, relative to x, that is treated as noise.
+    - `believed`: increments up to this size, relative to x, are treated as noise.
     - `iterations`: the number of iterations so far.
     - `done`, `converged`, `exhausted`: whether the iteration has ended, and how.
     """
@@ -110,10 +111,10 @@ def iterate(
     `iteration(x)` returns the next iterate, the sizes of the increment and of the
     iterate, and auxiliary values at x. Increments are measured relative to `scale`, the
     size of x, or relative to the size of the iterate if that is larger, because x may
-    start from zero. If both are zero, increments are measured relative to the first
-    one. The round-off of x is proportional to the same size or, if data are larger than
-    x, to `scale` plus `round_off`. `noise` is a measured size: increments always
-    contain errors of about the unit round-off times `noise`.
+    start from zero. If both sizes are zero, increments are measured relative to the
+    first increment. The round-off of x is proportional to the same size or, if data are
+    larger than x, to `scale` plus `round_off`. `noise` is a measured size: increments
+    always contain errors of about the unit round-off times `noise`.
 
     The iteration ends
 
@@ -126,11 +127,11 @@ def iterate(
     threshold would be either too coarse or never met (Hairer, Lubich, Wanner, GNI,
     section VIII.6). Each time that an increment fails to fall, the level of increments
     that are treated as noise is raised, up to `noise_units` of round-off. Each new
-    smallest increment lowers it again. The default of the highest level is the square
-    root of the unit round-off. It suits iterations that converge so fast that only
-    noise can slow them down. After many iterations all levels fall again, in proportion
-    to the number of iterations, because the error of a slow iteration is much larger
-    than its increment.
+    smallest increment lowers this level again. The default of the highest level is the
+    square root of the unit round-off. This default suits iterations that converge so
+    fast that only noise can slow them down. After more than 100 iterations all levels
+    fall in inverse proportion to the number of iterations, because the error of a slow
+    iteration is much larger than its increment.
     """
     # `jit` makes JAX trace the iteration only once, for both the shapes and the loop.
     # Tracing the iteration is most of the work of tracing a step.
@@ -190,8 +191,8 @@ def _progress(rules: _Rules, before: _Progress, sizes: UpdateNorms) -> _Progress
         # eps^(1/n). The error that it leaves is larger than an increment, by a factor
         # that grows with n.
         left = increment * jnp.maximum(1, count.astype(increment.dtype) / _SLOW)
-    # Only increments that can be noise raise the level `believed`: the increments of an
-    # iteration that spirals towards the solution rise and fall as well.
+    # Only increments that can be noise raise the level `believed`. Larger increments
+    # also rise and fall if an iteration spirals towards the solution.
     may_be_noise = left <= rules.noisiest * magnified
     stalls = may_be_noise & (increment >= before.smallest)
     more = jnp.minimum(rules.growth * before.believed, rules.noisiest)
@@ -204,7 +205,7 @@ def _progress(rules: _Rules, before: _Progress, sizes: UpdateNorms) -> _Progress
     least = jnp.where(has_size, least, rules.tolerance_or_eps * before.first)
     small = increment <= least
     converged = small | stagnant
-    # This is False if the increment is not finite.
+    # If the increment is not finite, this comparison is False.
     bounded = increment < _HOPELESS * (measure + first)
     exhausted = bounded & ~converged & (count >= rules.max_iterations)
     return _Progress(

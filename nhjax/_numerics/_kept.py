@@ -1,10 +1,10 @@
 """Functions of a user that are traced and differentiated once.
 
 A run needs the Lagrangian of a system and its derivatives at more than ten places, and
-JAX traces and differentiates a function again at each of them. This would take most of
+JAX traces and differentiates a function again at each place. This would take most of
 the time of a first call. Here a function becomes one operation, `kept_call`, whose
-program is traced once. The programs of its derivatives are kept with it, and later runs
-reuse all of these programs.
+program is traced once. The programs of its derivatives are stored together with this
+program, and later runs reuse all of them.
 """
 
 from collections import OrderedDict
@@ -33,28 +33,30 @@ from ..lanes import (
 from ._contraction import with_small_products
 
 
-# The programs of the functions that were used last are kept, up to this number.
+# The number of functions whose programs are stored. If there are more, the programs of
+# the least recently used function are removed.
 _MOST_FUNCTIONS = 32
 
 
 class KeptFunction(eqx.Module):
-    """A traced function as one operation, whose arrays are leaves.
+    """A traced function as one operation. It is a tree whose leaves are its arrays.
 
-    Call it with trees of the structure of the example with which it was traced. Leaves
-    that are not arrays keep the values that they have in the example. Derivatives reach
-    all arrays that the function reads.
+    Call an instance with trees of the structure of the example with which the function
+    was traced. Leaves that are not arrays always have the values that they have in the
+    example. The operation can be differentiated with respect to all arrays that the
+    function reads.
     """
 
-    # Constants may have a type of JAX that is not `jax.Array`.
+    # The type is not `jax.Array`, because JAX has other types for some constants.
     operands: list[Any]
     program: "_Program" = eqx.field(static=True)
     structure: Any = eqx.field(static=True)
 
     def __call__(self, *args: Any) -> PyTree[Array]:
-        """Compute the function."""
+        """Compute the function for these arguments."""
         given = jax.tree.leaves(eqx.filter(args, eqx.is_array))
         kinds = self.program.closed.in_avals[len(self.operands) :]
-        # The program has one dtype for each operand.
+        # The arguments are converted to the dtypes for which the program was traced.
         given = [
             x if x.dtype == y.dtype else jnp.asarray(x, y.dtype)
             for x, y in zip(given, kinds, strict=True)
@@ -74,13 +76,14 @@ def kept_function(
     """Trace a function for arguments with the structure and the dtypes of an example.
 
     If the same function is traced again for the same kinds of arguments, and the values
-    that it reads have not changed, its programs are reused. The result is None for a
-    function that must not become one operation: because it has effects, such as
-    printing, or because its arguments are sharded over devices.
+    that it reads have not changed, its programs are reused. The result is None if the
+    function must not become one operation, because it has effects, such as printing, or
+    because its arguments or constants are sharded over devices.
 
     **Arguments:**
 
-    - `function`: a function, or a tree that can be called, whose arrays are operands.
+    - `function`: a function, or a tree that can be called. Its arrays become operands
+        of the operation.
     - `example`: arguments of the function: trees of arrays and other objects.
     """
     arrays, others = eqx.partition((function, example), eqx.is_array)
@@ -151,7 +154,8 @@ class _Program:
     """A program with the programs of its derivatives, each traced on its first use."""
 
     def __init__(self, closed: Any):
-        # An attribute `jaxpr` would be taken for a second program of each operation.
+        # The attribute is not named `jaxpr`, because searches for the inner programs of
+        # an operation would then find the program twice.
         self.closed = closed
         self._derived: dict[Any, _Program] = {}
 
@@ -202,8 +206,10 @@ def _inlined(*operands: Any, jaxpr: Any, kept: _Program) -> list[Any]:
     return kept.run(*operands)
 
 
-# Measured on the gallery's systems that XLA compiles, most of all with 6 to 8 stages: a
-# call of native code takes longer than the function of a textbook system.
+# In a program that XLA compiles, functions with fewer operations than this are compiled
+# by XLA too: a call of native code takes longer than the function of a textbook system.
+# The number was measured on the gallery's systems that XLA compiles, mainly with 6 to 8
+# stages.
 _XLA_BELOW = 300
 
 
@@ -216,8 +222,8 @@ def _in_kernel(*operands: Any, jaxpr: Any, kept: _Program) -> list[Any]:
 
 
 # JAX must not cache a lowered program, because a program is lowered differently inside
-# and outside of a kernel. On the CPU `run_program` lowers the programs, because they
-# are long, and XLA takes milliseconds to compile each operation.
+# and outside of a kernel. On the CPU, programs are lowered by `run_program` and not by
+# XLA: the programs are long, and XLA takes milliseconds to compile each operation.
 for _lower, _platform in ((_inlined, None), (_in_kernel, "cpu")):
     mlir.register_lowering(
         kept_call,

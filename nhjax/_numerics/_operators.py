@@ -1,9 +1,10 @@
 """The matrices of a step as operators: dense, diagonal, sparse or block tridiagonal.
 
-A step multiplies vectors by four kinds of matrices. With N = ∂p/∂u, the fibre Hessian K
-(the mass matrix or its inverse) and the Jacobian B of the constraints, these are N⁻¹,
-B, K⁻¹ Bᵀ and (B K⁻¹ Bᵀ)⁻¹. Each of them is an `AbstractOperator`. The classes differ in
-how they store the entries:
+A step multiplies vectors by four kinds of matrices. Let u be the velocity or the
+momentum p, N = ∂p/∂u, K the fibre Hessian (the mass matrix or its inverse), and B the
+Jacobian of the constraints. Then the four matrices are N⁻¹, B, K⁻¹ Bᵀ and
+(B K⁻¹ Bᵀ)⁻¹. Each of them is an `AbstractOperator`. The subclasses differ in how they
+store the entries:
 
 - `DenseMatrix` stores all entries, `DiagonalMatrix` only the diagonal.
 - `SparseMatrix` stores the entries of a Jacobian B whose rows have few entries, in
@@ -11,7 +12,7 @@ how they store the entries:
 - `BlockTridiagonalInverse` is the inverse of a block tridiagonal matrix such as B K⁻¹
   Bᵀ, stored as its factors.
 
-Code outside this file does not check the class of an operator: it calls the methods.
+Code outside this file does not check the class of an operator. It only calls methods.
 """
 
 from abc import abstractmethod
@@ -57,7 +58,7 @@ class DenseMatrix(AbstractOperator):
 
     @property
     def pattern(self) -> None:
-        """Return the places of the entries of a sparse matrix: None."""
+        """Return None, because only sparse matrices have a sparsity pattern."""
         return None
 
     @property
@@ -98,7 +99,8 @@ class DenseMatrix(AbstractOperator):
     def is_definite(self) -> BoolScalar:
         """Return whether a symmetric matrix is positive or negative definite.
 
-        This holds if all pivots of the elimination without row exchanges have one sign.
+        The matrix is definite if all pivots of the elimination without row exchanges
+        have the same sign.
         """
         rows = jnp.arange(self.entries.shape[0])
 
@@ -118,17 +120,17 @@ class DenseMatrix(AbstractOperator):
     ) -> BoolScalar:
         """Return whether left @ right is singular up to round-off.
 
-        The inverse of the product is `self`.
+        `self` must be the computed inverse of this product.
         """
         factors = left.as_matrix(), right.as_matrix()
         return is_nearly_singular(small_einsum("kn,nl->kl", *factors), self.entries)
 
     def first_columns(self, count: int) -> "DenseMatrix":
-        """Return the matrix of the first columns."""
+        """Return the matrix of the first `count` columns."""
         return DenseMatrix(self.entries[..., :count])
 
     def weighted_transpose(self, weights: AbstractOperator) -> "DenseMatrix":
-        """Compute W Bᵀ for a symmetric W and each matrix B of the stack."""
+        """Compute W Bᵀ for symmetric weights W and each matrix B of this stack."""
         return DenseMatrix(jnp.swapaxes(weights.matvec(self.entries), -1, -2))
 
     def inverse_of_product(self, right: AbstractOperator) -> "DenseMatrix":
@@ -147,7 +149,7 @@ class DenseMatrix(AbstractOperator):
     def max_norm_equivalent(self) -> "DenseMatrix":
         """Return a matrix whose products with vectors have the same max norm.
 
-        For a matrix with one column this is its largest entry.
+        If this matrix has one column, the result is a matrix of one entry, max |a_ij|.
         """
         if self.entries.shape[1] != 1:
             return self
@@ -300,11 +302,12 @@ class WeightedTranspose(AbstractOperator):
 
 
 class BlockTridiagonalInverse(AbstractOperator):
-    """The inverse of a block tridiagonal matrix, by the factors of its elimination.
+    """The inverse of a block tridiagonal matrix, stored as factors of an elimination.
 
-    There are q unknowns and q residuals for each row of the pattern, of shape (q, l) or
-    in one vector. Blocks are eliminated from the first to the last. With the diagonal,
-    lower and upper blocks D_k, L_k and U_k of row k, and
+    There are q unknowns and q residuals for each of the l rows of the pattern. They are
+    arrays of shape (q, l), or vectors of length q l. Blocks are eliminated from the
+    first to the last. With the diagonal, lower and upper blocks D_k, L_k and U_k of
+    row k, and
 
     P_k = D_k - L_k P_{k-1}⁻¹ U_{k-1},
 
@@ -319,7 +322,7 @@ class BlockTridiagonalInverse(AbstractOperator):
     pattern: "SparsityPattern" = eqx.field(static=True)
 
     def matvec(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Compute the solution for a residual."""
+        """Multiply a residual x by the inverse matrix."""
         pattern, count = self.pattern, self.inverses.shape[0]
         size, shape = pattern.shape[0], x.shape
         ordered = static_take(x.reshape(-1, size), pattern.order)
@@ -345,7 +348,7 @@ class BlockTridiagonalInverse(AbstractOperator):
         return static_take(x[:, :size], np.argsort(pattern.order)).reshape(shape)
 
     def absolute(self) -> AbstractOperator:
-        """Return an operator that estimates products with the absolute values."""
+        """Return an operator that estimates products with the matrix |C⁻¹|."""
         return _EstimatedAbsolute(self)
 
     def as_matrix(self) -> Float[Array, "c c"]:
@@ -376,12 +379,12 @@ class BlockTridiagonalInverse(AbstractOperator):
 
 
 class _EstimatedAbsolute(AbstractOperator):
-    """An estimate of |C⁻¹|, by products with C⁻¹ alone.
+    """An estimate of |C⁻¹|, the absolute values of an inverse, by products with C⁻¹.
 
-    For x >= 0, each entry of |C⁻¹| x is the largest |C⁻¹ y| of all y that differ from x
-    in signs alone. The estimate takes two choices of signs. It is exact for the
-    matrices of a chain of springs or rods: the entries of their inverses have the same
-    sign, or signs that alternate.
+    For x >= 0, entry i of |C⁻¹| x is the maximum of entry i of |C⁻¹ y| over all y that
+    differ from x only in the signs of entries. The estimate uses two choices of signs.
+    It is exact for the matrices of a chain of springs or rods: the entries of their
+    inverses have the same sign, or signs that alternate.
     """
 
     map: BlockTridiagonalInverse
@@ -393,11 +396,11 @@ class _EstimatedAbsolute(AbstractOperator):
         return jnp.maximum(jnp.abs(self.map.matvec(x)), jnp.abs(other))
 
     def absolute(self) -> AbstractOperator:
-        """Return self, whose products with x >= 0 are not negative."""
+        """Return self, because products with x >= 0 are never negative."""
         return self
 
     def as_matrix(self) -> Float[Array, "l l"]:
-        """Return |C⁻¹| as an array, which is exact."""
+        """Return the exact |C⁻¹| as an array."""
         return jnp.abs(self.map.as_matrix())
 
 
@@ -419,8 +422,8 @@ def square_jacobian(
 
     The mass matrices of most Lagrangians are diagonal, so that their products with
     vectors cost n instead of n² operations. Whether the Jacobian is diagonal is decided
-    from the operations of the traced function and not from values. A function whose
-    operations are not understood counts as dense.
+    from the operations of the traced function and not from values. If the sparsity of
+    an operation is not known, the Jacobian counts as dense.
     """
 
     def push(du):
@@ -437,7 +440,7 @@ def square_jacobian(
 def full_jacobian(
     function: Callable[[Array], PyTree[Array]], u: Float[Array, " n"]
 ) -> PyTree[Array]:
-    """Compute the derivatives of all results of a function in u, on their last axis."""
+    """Compute the derivatives of all results with respect to u, on their last axis."""
 
     def push(du):
         return jax.jvp(function, (u,), (du,))[1]
@@ -456,9 +459,9 @@ def jacobian_by_rows(
 
 
 def _unit_vectors(u: Float[Array, " n"]) -> Float[Array, "n n"]:
-    # The compiler of `nhjax.lanes` knows that zeros which pad an array stay zero in any
-    # product. It cannot assume this for the zeros of `jnp.eye`, because the other
-    # factor might be infinite.
+    # For `nhjax.lanes`, the product of any number with a zero that pads an array is
+    # zero. A product with a zero of `jnp.eye` must be computed, because the other
+    # factor may be infinite.
     n, one, zero = u.shape[0], jnp.ones((1,), u.dtype), jnp.zeros((), u.dtype)
     rows = [jax.lax.pad(one, zero, [(k, n - 1 - k, 0)]) for k in range(n)]
     return jnp.stack(rows)
@@ -471,7 +474,8 @@ def sparse_jacobian(
 ) -> SparseMatrix:
     """Compute the Jacobian of a function with the sparsity pattern `pattern`.
 
-    One tangent serves for all columns of a colour (Curtis, Powell and Reid, 1974).
+    One tangent gives all columns of the same colour, because these columns have no row
+    in common (Curtis, Powell and Reid, 1974).
     """
     number = int(pattern.colours.max()) + 1
     chosen = pattern.colours[None, :] == np.arange(number)[:, None]
@@ -495,9 +499,10 @@ class SparsityPattern:
 
     - `columns`: entry e of row a is in column `columns[e, a]`, shape (w, l); it exists
         where `present` is true.
-    - `rows`: entry e of column i is number `rows[e, i]` of the (w, l) entries; it
-        exists where `holds` is true.
-    - `colours`: columns of the same colour have no row in common, shape (n,).
+    - `rows`: entry e of column i has the index `rows[e, i]` in the flattened array of
+        (w, l) entries; it exists where `holds` is true.
+    - `colours`: the colour of each column, shape (n,). Columns of the same colour have
+        no row in common.
     - `order`: an order of the rows in which rows that share columns are near each
         other. In this order B K Bᵀ is block tridiagonal for a diagonal K, with `group`
         rows in each block.
@@ -508,7 +513,7 @@ class SparsityPattern:
         self.shape = entries.shape
         self.columns, self.present = _listed(entries)
         where, self.holds = _listed(entries.T)
-        # The number of an entry follows from its place in its row and from the row.
+        # The index of entry e of row a in the flattened array is e l + a.
         rank = np.cumsum(entries, axis=1) - 1
         columns = np.broadcast_to(np.arange(self.shape[1]), where.shape)
         self.rows = np.where(self.holds, rank[where, columns], 0) * len(entries) + where
@@ -533,7 +538,10 @@ class SparsityPattern:
 
 
 def _listed(entries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """List the columns of the entries of each row, of shape (w, l), and which exist."""
+    """List the columns of the entries of each row, and which entries exist.
+
+    Both results have the shape (w, l).
+    """
     counts = entries.sum(axis=1)
     width = max(int(counts.max()), 1)
     found = np.zeros((width, len(entries)), int)
@@ -572,11 +580,11 @@ def compressed_products(
 ) -> Float[Array, "r s c b l"]:
     """Compute all products L_i diag(w) R_jᵀ of two stacks in compressed form.
 
-    The products are block tridiagonal in the order of the pattern. So each row has
-    entries in at most one of the blocks whose numbers are equal modulo three, and the
-    columns of these blocks can be added. Entry [i, j, c, b, a] of the result is the
-    entry of product (i, j) in row a and in column b of the block whose number is c
-    modulo three.
+    The products are block tridiagonal in the order of the pattern. Among all blocks
+    whose numbers are equal modulo three, each row therefore has entries in at most one
+    block, so that the columns of these blocks can be added. Entry [i, j, c, b, a] of
+    the result is the entry of product (i, j) in row a and in column b of the block
+    whose number is c modulo three.
     """
     pattern = left.pattern
     place = np.argsort(pattern.order)
@@ -599,16 +607,16 @@ def block_tridiagonal_inverse(
 ) -> BlockTridiagonalInverse:
     """Factorise a matrix in the compressed form of `compressed_products`.
 
-    The matrix has q equations and q unknowns for each row of the pattern. The entry for
-    equation i at row a and unknown j at column b of a block is in `products[i, j]`,
-    which may combine several products.
+    The matrix has q equations and q unknowns for each row of the pattern. The entries
+    for equation i and unknown j are in `products[i, j]`, which may be a linear
+    combination of several products.
     """
     q, size, g = products.shape[0], products.shape[-1], pattern.group
     count = -(-size // (3 * g)) * 3
     ordered = static_take(products, pattern.order)
     ordered = jnp.pad(ordered, (*[(0, 0)] * 4, (0, count * g - size)))
-    # The axes: equation, unknown, sum, column, group of three blocks, block inside the
-    # group, row.
+    # The axes: equation, unknown, block number modulo three, column in the block, group
+    # of three blocks, block inside the group, row in the block.
     split = ordered.reshape(q, q, 3, g, count // 3, 3, g)
 
     def diagonal(offset):
@@ -636,13 +644,13 @@ def block_tridiagonal_inverse(
 
 # Elements of an array at places that are known when the program is traced.
 
-# With more pieces than this the program would be long, and an indexed read is better.
+# An array is not composed of more slices than this, because the program would be long.
 _MOST_PIECES = 16
 _PERIODS = (1, 2, 3, 4, 6)
 
 
 def static_take(x: Array, index: Int[np.ndarray, " k"]) -> Array:
-    """Compute `x[..., index]` for known indices, by slices if few are enough.
+    """Compute `x[..., index]` for known indices, by slices if a few slices are enough.
 
     The indices of regular structures are arithmetic sequences, or a few interleaved
     arithmetic sequences. A slice can be part of a kernel; an indexed read cannot.
@@ -677,7 +685,7 @@ def _runs(index: Sequence[int] | np.ndarray) -> list[np.ndarray]:
             or index[end] - index[end - 1] == index[start + 1] - index[start]
         ):
             end += 1
-        # Slices only go forward: if the indices decrease, a run has a single index.
+        # Slices only go forward: if the indices decrease, the run ends after one index.
         if end > start + 1 and index[start + 1] < index[start]:
             end = start + 1
         runs.append(np.asarray(index[start:end]))

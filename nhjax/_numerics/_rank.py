@@ -4,7 +4,8 @@ Constraints are independent if the rows of their Jacobian B are independent. A
 `RankCondition` is a Jacobian whose rank must be full, `reciprocal_condition` measures
 how close the rows are to being dependent, and `dependent_rows` lists the rows for an
 error message. Where redundant constraints are allowed, `least_norm_inverse` replaces
-the inverse of C = B K⁻¹ Bᵀ: it solves C x = b with the least norm of x.
+the inverse of C = B K⁻¹ Bᵀ, in which K is the mass matrix or its inverse. It solves
+C x = b with the least norm of x.
 """
 
 from typing import NamedTuple
@@ -24,9 +25,10 @@ from .._custom_types import BoolScalar, FloatScalar
 class RankCondition(NamedTuple):
     """The derivatives of constraints at a configuration, which must have full rank.
 
-    The `jacobian` has k rows of DΓ, or m + k rows of D2Φ and DΓ. Its rank matters only
-    if `is_active`. The rank at the starting values of Newton's method is active only if
-    the method fails; otherwise the method has moved to another configuration.
+    For k constraints Γ on positions and m constraints Φ on velocities, the `jacobian`
+    has the k rows of DΓ, or the m + k rows of D2Φ and DΓ. Its rank matters only if
+    `is_active` is true. The rank at the starting values of Newton's method is active
+    only if the method fails; otherwise the method has moved to another configuration.
     """
 
     jacobian: Float[Array, "l n"]
@@ -40,7 +42,7 @@ class RankCondition(NamedTuple):
 
 
 def active_ranks(ranks: list[RankCondition]) -> list[RankCondition]:
-    """Keep at most one matrix of each shape, namely the active one.
+    """Return at most one matrix of each shape: the active matrix, if there is one.
 
     Singular values are more expensive than all other operations here, so that they are
     computed for as few matrices as possible.
@@ -60,18 +62,20 @@ def reciprocal_condition(matrix: Float[Array, "k l"]) -> FloatScalar:
 
     In a square matrix, row k and column k are both divided by the square root of the
     largest entry of row k. In other matrices, each row is divided by its largest entry.
-    This makes the ratio independent of the units of the quantities that belong to the
-    rows: of constraints, or of coordinates in a mass matrix.
+    This scaling makes the result independent of the units of the quantities that belong
+    to the rows: the constraints, or the coordinates in a mass matrix.
     """
     if matrix.shape[0] == 0:
         return jnp.ones((), matrix.dtype)
     rows = jnp.max(jnp.abs(matrix), axis=1)
     if matrix.shape[0] == 1:
-        # There is one singular value. The library call would take long to compile.
+        # There is only one singular value. No library is called, because the call would
+        # take long to compile.
         return jnp.where(rows[0] == 0, 0, rows[0] / rows[0])
     rows = jnp.where(rows > 0, rows, 1)
     if matrix.shape[0] == matrix.shape[1]:
-        # The matrix is divided by one root after the other: their product can overflow.
+        # The matrix is divided by one root after the other, because the product of two
+        # roots can overflow.
         roots = jnp.sqrt(rows)
         scaled = matrix / roots[:, None] / roots[None, :]
     else:
@@ -109,9 +113,10 @@ def is_nearly_singular(
 ) -> BoolScalar:
     """Return whether a matrix is singular to round-off, given its computed inverse.
 
-    Rows and columns are scaled as for a Gram matrix. The product of the largest entries
-    of the matrix and of its inverse then estimates the condition number. No library of
-    linear algebra is called, so that the estimate can be part of any kernel.
+    Rows and columns are divided by the square roots of the diagonal entries. The
+    product of the largest entries of the scaled matrix and of its inverse then
+    estimates the condition number. No library of linear algebra is called, so that the
+    estimate can be part of any kernel.
     """
     size = matrix.shape[0]
     if size < 2:
@@ -127,16 +132,18 @@ def is_nearly_singular(
 
 
 def _negligible(dtype: jnp.dtype) -> float:
-    """Return the size of eigenvalues of a scaled matrix that count as zero.
+    """Return the relative size of eigenvalues of a scaled matrix that count as zero.
 
-    An eigenvalue that is zero is computed as a few units of round-off. Constraints that
-    are so close to being dependent cannot be distinguished from dependent constraints.
+    The computed value of a zero eigenvalue is a few units of round-off. Constraints
+    whose matrix has such a small eigenvalue cannot be distinguished from dependent
+    constraints.
     """
     return float(jnp.finfo(dtype).eps) ** 0.75
 
 
 # Equations that are dependent at a solution are only nearly dependent at other points.
-# There, singular values below this fraction of the largest one count as zero.
+# At such points, singular values below this fraction of the largest singular value
+# count as zero.
 NEARLY_DEPENDENT = 1e-4
 
 
@@ -145,10 +152,11 @@ def least_norm_inverse(
 ) -> Float[Array, "l l"]:
     """Compute the inverse X of a symmetric C that solves C x = b with the least norm.
 
-    If C x = b has solutions, X b is the solution with the least Σ C_aa x_a². With
-    D = diag(C_aa)^(-1/2) it is X = D (D C D)⁺ D. Eigenvalues of D C D count as zero if
-    they are round-off, or less than `negligible` times the largest one. If some
-    constraints are scaled, only their multipliers are scaled.
+    If C x = b has solutions, X b is the solution with the least Σ C_aa x_a². The
+    inverse is X = D (D C D)⁺ D with D = diag(C_aa)^(-1/2). Eigenvalues of D C D count
+    as zero if they are at most `negligible` times the largest eigenvalue. The default
+    is close to round-off. If some constraints are scaled, only their multipliers
+    change.
     """
     if matrix.shape[0] == 0:
         return matrix
@@ -162,21 +170,22 @@ def least_norm_inverse(
 def least_norm_inverse_by_blocks(
     matrix: Float[Array, "l l"], first: int
 ) -> Float[Array, "l l"]:
-    """Compute a generalised inverse of C that solves the last equations first.
+    """Compute a generalised inverse of C; the last equations have priority.
 
     The equations have two parts, and `first` is the number of equations in the first
-    part. The unknowns of the first part are zero as far as its equations follow from
-    the second part. Apart from this, each of the two parts of x has the least norm of
+    part. As far as equations of the first part follow from the second part, their
+    unknowns are zero. Apart from this, each of the two parts of x has the least norm of
     `least_norm_inverse`. If no equation of one part follows from the other part, the
-    result is `least_norm_inverse`.
+    result is equal to the result of `least_norm_inverse`.
     """
     if first in (0, matrix.shape[0]):
         return least_norm_inverse(matrix)
     others = least_norm_inverse(matrix[first:, first:])
     onto = matrix[:first, first:] @ others
-    # If an equation follows from the others, its part of the Schur complement is
-    # round-off. The additional block of size one makes `pinv` compare this part with
-    # one, the size of the scaled diagonal before the elimination.
+    # If an equation of the first part follows from the second part, its part of the
+    # Schur complement is round-off. The additional block of size one makes `pinv`
+    # compare this round-off with one, the size of the scaled diagonal before the
+    # elimination.
     left = matrix[:first, :first] - onto @ matrix[first:, :first]
     root = _roots(matrix[:first, :first])
     scaled = jax.scipy.linalg.block_diag(
@@ -189,14 +198,14 @@ def least_norm_inverse_by_blocks(
 
 
 def rank_of_gram(matrix: Float[Array, "l l"]) -> Int[Array, ""]:
-    """Compute the rank of a symmetric matrix as in `least_norm_inverse`."""
+    """Count the eigenvalues that are not negligible in `least_norm_inverse`."""
     if matrix.shape[0] == 0:
         return jnp.zeros((), int)
     return jnp.sum(_eigenvalues(matrix)[1])
 
 
 def reciprocal_condition_of_range(matrix: Float[Array, "l l"]) -> FloatScalar:
-    """Divide the smallest nonzero eigenvalue by the largest eigenvalue."""
+    """Divide the smallest nonzero by the largest eigenvalue of the scaled matrix."""
     if matrix.shape[0] == 0:
         return jnp.ones((), matrix.dtype)
     values, is_kept = _eigenvalues(matrix)
@@ -223,8 +232,8 @@ def _roots(matrix: Float[Array, "l l"]) -> Float[Array, " l"]:
 def least_norm_solve(matrix: Float[Array, "l l"], b: Array) -> Array:
     """Solve nearly dependent symmetric equations, ignoring small singular values.
 
-    Rows and columns are first scaled to about size one. Newton's method uses this
-    function if the equations are dependent at the solution.
+    Rows and columns are first scaled so that their largest entries are about one.
+    Newton's method uses this function if the equations are dependent at the solution.
     """
     largest = jnp.max(jnp.abs(matrix), axis=1)
     size = jnp.sqrt(jnp.where(largest > 0, largest, 1))

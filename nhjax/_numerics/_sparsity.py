@@ -19,12 +19,13 @@ from ..lanes import CALLING, ELEMENTWISE, SMALL_PRODUCT
 
 
 # These operations rearrange the elements of their operands. NumPy rearranges the sets
-# of inputs in the same way. A gather needs the values of its indices.
+# of inputs in the same way. For a gather, the values of its indices must be known.
 _REARRANGING = """
     broadcast_in_dim concatenate copy copy_p expand_dims gather pad reshape rev slice
     split squeeze transpose
 """.split()  # noqa: SIM905
-# Values that may be indices are computed if they have at most this many elements.
+# Integers and booleans may be indices. They are computed if an array has at most this
+# many elements.
 _LONGEST_INDEX = 10_000
 
 
@@ -33,10 +34,10 @@ def jacobian_sparsity(
 ) -> Bool[np.ndarray, "l n"]:
     """Return which entries ∂f_a/∂u_i of a Jacobian may differ from zero at some u.
 
-    Sets of inputs are propagated through the program that computes directional
-    derivatives, so that an entry that is false is zero for all u. All results of a
-    loop, of a branch and of an unknown operation count as dependent on all of its
-    inputs.
+    Sets of inputs are propagated through the program that computes the derivative in a
+    direction du at u; the inputs are the entries of du. An entry that is false is
+    therefore zero for all u. If an operation is a loop, a branch or unknown, each of
+    its results counts as dependent on all its inputs.
     """
 
     def push(du):
@@ -52,12 +53,13 @@ def jacobian_sparsity(
     return found.reshape(-1, n)
 
 
-# The sets of the elements of an array, of shape (..., n), and its value if known.
+# For an array: the sets of inputs of its elements, as booleans of shape (..., n), and
+# the value of the array, or None if the value is not known.
 _Value = tuple[np.ndarray, np.ndarray | None]
 
 
 def _known(x: Any) -> np.ndarray | None:
-    """Return the value of a constant that indices may be computed from, or None."""
+    """Return the value of a constant if indices may depend on it, otherwise None."""
     if isinstance(x, jax.core.Tracer) or np.size(x) > _LONGEST_INDEX:
         return None
     return np.asarray(x) if _may_be_index(np.asarray(x).dtype) else None
@@ -102,7 +104,7 @@ def _results(equation: Any, inputs: list[_Value], n: int) -> list[_Value]:
         out = _applied(equation, known)
         return [(np.zeros((*x.shape, n), bool), x) for x in out]
     if not inputs:
-        # Operations without operands, such as `iota`.
+        # Operations without operands, such as `iota`, depend on no input.
         return [(np.zeros((*shape, n), bool), None) for shape in shapes]
     sets = [s for s, _ in inputs]
     found = _sets(equation, sets, known, shapes)
@@ -188,7 +190,7 @@ def _rearranged(
     if name in ("copy", "copy_p"):
         return [x]
     if name in ("expand_dims", "reshape", "squeeze"):
-        # These operations keep the order of the elements.
+        # These operations do not change the order of the elements.
         return None if params.get("dimensions") and name == "reshape" else [x]
     if name == "transpose":
         return [np.transpose(x, (*params["permutation"], last))]

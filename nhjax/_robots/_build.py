@@ -44,7 +44,7 @@ _KINDS = ("free", "ball", "slide", "hinge")
 class Layout:
     """The joints of a model, and the frame of each body relative to its last joint.
 
-    `source` is the `MjSpec` or `MjModel` that was read; films take the shapes from it.
+    `source` is the `MjSpec` or `MjModel` that was read; films show its shapes.
     The positions of the bodies with the names `moving` are parameters.
 
     Layouts are compared by identity, so that a layout can be a static field of a
@@ -65,7 +65,7 @@ class Layout:
         self.source = source
 
     def __getstate__(self) -> dict[str, Any]:
-        # An MjSpec cannot be pickled. Only films need it.
+        # `source` is dropped, because an MjSpec cannot be pickled. Only films need it.
         return self.__dict__ | {"source": None}
 
 
@@ -123,7 +123,8 @@ def mechanics_of(
     tendons, numbers = fixed_tendons(model, space, "tendons" in ignore)
     tendon_armature = model.tendon_armature[numbers].copy()
     tendon_damping = model.tendon_damping[numbers].copy()
-    # MuJoCo adds damping and armature of actuators to those of joints and tendons.
+    # Like MuJoCo, add the damping and armature of actuators to the damping and armature
+    # of their joints and tendons.
     for i in range(model.nactuator):
         square = model.actuator_gear[model.actuator_outadr[i], 0] ** 2
         target, kind = model.actuator_trnid[i, 0], model.actuator_trntype[i]
@@ -434,7 +435,7 @@ def loops_in(model: Any, layout: Layout, left_out: set[int]) -> Loops:
             ]
         elif is_weld:
             # The first body has the pose data[3:10] relative to the anchor of the
-            # second one at data[:3].
+            # second body, whose position in the second body is data[:3].
             frames = [
                 fixed_to(layout, ends[0], data[3:6], data[6:10]),
                 fixed_to(layout, ends[1], data[:3], none),
@@ -607,7 +608,7 @@ def check_wheels(
                         "vertical. Turn it: in a URDF file, write "
                         '`rpy="1.5708 0 0"` into the `<origin>` of its `<collision>`.'
                     )
-            # Without slip along its track, the wheel has to turn about its axis.
+            # If the wheel does not slip along its track, it must turn about its axis.
             turns = any(x not in ("across", "spin") for x in no_slip)
             parallel = abs(frame.matrix[:3, 2] @ joint.axis) > 1 - 1e-6
             if turns and joint.kind in ("hinge", "slide") and not parallel:
@@ -797,7 +798,7 @@ class _Rows:
         self.evaluate = jax.jit(self._evaluate)
 
     def __getstate__(self) -> dict[str, Any]:
-        # A compiled function cannot be pickled.
+        # `evaluate` is dropped, because a compiled function cannot be pickled.
         return {k: x for k, x in self.__dict__.items() if k != "evaluate"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -805,8 +806,8 @@ class _Rows:
         self.evaluate = jax.jit(self._evaluate)
 
     def _positions(self, q: PyTree[Array], args: Args) -> Array:
-        # Constraints on positions come first and are kept; a constraint on velocities
-        # that follows from them is left out.
+        # Constraints on positions come first, so that of two dependent constraints the
+        # constraint on velocities is left out.
         rows = [x.height(0.0, q, args)[None] for x in self.heights]
         if self.loop is not None:
             rows.append(self.loop(0.0, q, args))
@@ -827,9 +828,10 @@ class _Rows:
 
 
 class LeftOut:
-    """The constraints that follow from the others with the lengths of the file.
+    """The constraints that are left out.
 
-    Objects are compared by identity, so that one can be a static field of a `Robot`.
+    They follow from the others if all lengths have the values of the file. Objects are
+    compared by identity, so that a `LeftOut` can be a static field of a `Robot`.
     """
 
     def __init__(self, rows: _Rows, keep: np.ndarray):

@@ -19,15 +19,16 @@ from ._tree import displacement, Frame, FramePoses, Space, Tree
 
 
 class Bodies(NamedTuple):
-    """The bodies that can move, as arrays with one row for each.
+    """The bodies that can move, as arrays with one row for each body.
 
     - `names`, `joints`: the name of each body, and the number of the last joint on the
         path from the world to the body.
     - `inertia`: the pseudo-inertia [[Σ m x xᵀ, Σ m x], [Σ m xᵀ, Σ m]] in the frame
         after that joint.
-    - `mass`: in kg.
+    - `mass`: the masses [kg].
     - `weight`: the fraction of the weight that gravity compensation leaves.
-    - `shifts`: the parameters that move each body relative to that frame.
+    - `shifts`: the parameters that move each body relative to the frame after its
+        joint.
     """
 
     names: tuple[str, ...]
@@ -102,7 +103,7 @@ class Parameters(eqx.Module):
     controls: tuple[str, ...] | None = eqx.field(static=True)
 
     def replaced(self, kind: str, values: np.ndarray, args: Args, dtype: Any) -> Any:
-        """Return the array `values`, with the entries that `args` gives replaced."""
+        """Return the array `values`, in which the values given in `args` are used."""
         given = given_in(args, kind)
         if not given:
             return jnp.asarray(values, dtype)
@@ -186,7 +187,8 @@ def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
     turned = {rotor.joint for rotor in merged.rotors}
     kept_joints = [j for j in range(len(mechanics.joints)) if j not in turned]
     tree = Tree(mechanics.joints, space, kept_joints)
-    # Bodies that are fixed to the world do not matter.
+    # Bodies that are fixed to the world are omitted: they have no kinetic energy, and
+    # their potential energy is constant.
     moving = [i for i, joint in enumerate(merged.joints) if joint >= 0]
     changed = sorted(variable.intersection(moving))
     total, total_moment = (
@@ -321,10 +323,11 @@ def _spring_energy(mechanics, parameters, q, args, dtype):
 
 
 class Actuators(NamedTuple):
-    """The actuators, with one row or entry for each.
+    """The actuators, with one row or entry for each actuator.
 
     The force of an actuator is (g₀ + g₁ l + g₂ l') u + b₀ + b₁ l + b₂ l', with its
-    control u and its length l = moment · q. Limits that are absent are infinite.
+    control u and its length l = moment · q. If an actuator has no limit, the limit is
+    infinite here.
     """
 
     names: tuple[str, ...]

@@ -19,8 +19,8 @@ from .._errors import check_choice
 # Angles in URDF files that differ by less than this [rad] from a multiple of a
 # quarter turn are replaced by this multiple.
 _ROUNDED_ANGLE = 1e-3
-# URDF files that were written for ROS give the files of meshes by addresses that begin
-# with this.
+# URDF files that were written for ROS name the files of meshes by addresses that begin
+# with this prefix.
 _PACKAGE = "package://"
 
 IGNORABLE = (
@@ -79,7 +79,7 @@ def compile_model(
                     "from_mujoco: an MjModel cannot get `motors`: pass an MjSpec."
                 )
             return model, model
-        # The caller may go on to change the spec.
+        # Use a copy, because the caller may change the spec later.
         spec = model.copy()
         return spec, _compile(spec, motors, "the MjSpec")
     if not isinstance(model, str | os.PathLike):
@@ -131,7 +131,7 @@ def _compile_file(
         _find_packages(tree.getroot(), path)
         text = ElementTree.tostring(tree.getroot(), encoding="unicode")
         spec = _or_message(lambda: spec_of.from_string(text), path)
-        # Meshes are searched for beside the file.
+        # MuJoCo then searches for meshes in the folder of the URDF file.
         spec.modelfiledir = str(path.parent)
         return spec, _compile(spec, motors, path)
     if root is not None:
@@ -563,7 +563,8 @@ def _touching_pairs(model: Any) -> list[tuple[int, int]]:
             is_parent = (
                 weld[one] == parent_of_weld[other] or weld[other] == parent_of_weld[one]
             )
-            # The filter of parents does not apply to the world.
+            # MuJoCo's filter of pairs of parent and child does not apply if the parent
+            # is the world.
             if filters_parents and is_parent and weld[one] and weld[other]:
                 continue
             low, high = min(one, other), max(one, other)

@@ -87,8 +87,8 @@ class Robot(eqx.Module):
         - `t`: the time.
         - `args`: the parameters and controls. The default is `self.args`.
         - `project`: whether to project the state onto the constraints.
-        - `keep_q`, `keep_v`: as for `nhjax.initial_state`. The names are those of
-            `self.coordinates`.
+        - `keep_q`, `keep_v`: as for `nhjax.initial_state`. `self.coordinates` has the
+            names that can be used.
 
         **Returns:** a `State`.
 
@@ -142,7 +142,7 @@ class Robot(eqx.Module):
     def qpos(self, sol: Any) -> Float[Array, "*times nq"]:
         """Return positions in MuJoCo's conventions.
 
-        A free joint has its position and then its quaternion.
+        For a free joint, they are the position and then the quaternion.
 
         **Arguments:**
 
@@ -155,8 +155,8 @@ class Robot(eqx.Module):
     def qvel(self, sol: Any) -> Float[Array, "*times nv"]:
         """Return velocities in MuJoCo's conventions.
 
-        A free joint has the velocity of its origin in space and then the angular
-        velocity in the frame of its body.
+        For a free joint, they are the velocity of its origin in space and then the
+        angular velocity in the frame of its body.
 
         **Arguments:**
 
@@ -257,11 +257,12 @@ def from_mujoco(
 
     MuJoCo's own compiler reads the model. The Lagrangian is the kinetic energy
     ½ Σ tr(Ṫ J Ṫᵀ) of all bodies with poses T and pseudo-inertias J, with ½ a q̇² for
-    each armature a, minus the energies of weight and springs. Free and ball joints are
-    on R³ x SO(3) and SO(3), all others on R^n. The equality constraints connect, weld,
-    joint and tendon are holonomic constraints. They hold exactly, unlike in MuJoCo,
-    and `solref` and `solimp` have no effect. Source: Featherstone, *Rigid body dynamics
-    algorithms* (2008); the MuJoCo documentation, chapter *Computation*.
+    each armature a, minus the potential energies of weight and springs. A free joint
+    has coordinates in R³ x SO(3), and a ball joint in SO(3). All other joints together
+    have coordinates in R^n. The equality constraints connect, weld, joint and tendon
+    become holonomic constraints. They hold exactly, unlike in MuJoCo, and `solref` and
+    `solimp` have no effect. Source: Featherstone, *Rigid body dynamics algorithms*
+    (2008); the MuJoCo documentation, chapter *Computation*.
 
     **Arguments:**
 
@@ -292,9 +293,9 @@ def from_mujoco(
         names in `rolling` for `"radius"`. `args` can then replace these values of the
         file. A body with another mass keeps its shape and its centre of mass. The
         position of a body is the vector [m] from the frame of its parent to its own
-        frame, of shape (3,), such as the length of a link; the body and all that is
-        attached to it move along. A wheel with another radius keeps its mass and its
-        inertia. Films show the lengths of the file.
+        frame, of shape (3,), such as the length of a link. Another vector moves the
+        body and all bodies attached to it. A wheel with another radius keeps its mass
+        and its inertia. Films show the lengths of the file.
     - `ignore`: unsupported parts to leave out: `"actuators"`, `"contacts"`,
         `"equalities"`, `"fluid"`, `"friction loss"`, `"limits"`, `"plugins"`,
         `"springs"`, `"tendons"`.
@@ -302,7 +303,7 @@ def from_mujoco(
         keep all constraints. By default, constraints that follow from others in every
         pose are left out, such as `"across"` of the second of two wheels on one axle.
         If constraints depend on each other only in some poses near the pose of the
-        file, the default keeps all and is `"redundant"`.
+        file, the default keeps all constraints, and is the same as `"redundant"`.
     - `friction_smoothing`: v₀ [rad/s or m/s] in the friction loss f tanh(q̇ / v₀) of a
         joint.
     - `limit_smoothing`: the width of the smooth transition at the limits of controls
@@ -418,7 +419,7 @@ def _coordinates(layout: Layout) -> tuple[str, ...]:
 
 
 def _joined(heights: Any, loop: Any) -> Any:
-    """Return the constraints of both kinds as one function, or None."""
+    """Return the contact heights and the loop constraints as one function, or None."""
     if heights is None or loop is None:
         return loop if heights is None else heights
 

@@ -1,9 +1,9 @@
 """Wheels and rotors: bodies whose inertia does not change while their joint turns.
 
-Such a body at the end of a branch needs no frame of its own. Its parent carries the
-body as if it were fixed, and the rate s' of the joint adds s' h·ξ + ½ I s'² to the
-kinetic energy, with the twist ξ of the parent. This makes the program of a robot on
-wheels as short as one that is written by hand.
+Such a body at the end of a branch needs no frame of its own. Its inertia is added to
+the parent as if the body were fixed to it, and the rate s' of the joint adds
+s' h·ξ + ½ I s'² to the kinetic energy, with the twist ξ of the parent. The program of a
+robot on wheels then is as short as a program that is written by hand.
 """
 
 from collections.abc import Sequence
@@ -41,7 +41,8 @@ class Merged(NamedTuple):
     rotors: list[Rotor]
 
 
-# Zero, and angles that are not simple fractions of a turn.
+# A body is a rotor if its inertia is the same at these angles of its joint: zero, and
+# angles that are not simple fractions of a turn.
 _ANGLES = (0.0, 1.1, 2.3, 4.1)
 
 

@@ -64,8 +64,8 @@ def parts_of(joints: Sequence[Joint]) -> tuple[Part, ...]:
 class Space:
     """The configuration space of a robot, and MuJoCo's coordinates of it.
 
-    The velocities are those of MuJoCo. A free joint has the velocity of its origin in
-    space and the angular velocity in the body.
+    The velocities are MuJoCo's `qvel`: a free joint has the velocity of its origin in
+    space, and the angular velocity in the frame of its body.
     """
 
     def __init__(self, joints: Sequence[Joint]):
@@ -97,7 +97,8 @@ class Space:
     def split(self, q: PyTree[Array]) -> tuple[list[tuple[Array, ...]], Array]:
         """Split q into the elements of free and ball joints, and all scalars.
 
-        A free joint has its position and its quaternion, a ball joint its quaternion.
+        The element of a free joint is a position and a quaternion; the element of a
+        ball joint is a quaternion.
         """
         elements = iter(q if self.is_product else (q,))
         special, scalars = [], []
@@ -152,8 +153,8 @@ class Level(NamedTuple):
 
     - `nodes`: their places among the joints of the tree, where free and ball joints
         come first.
-    - `parents`: for each, the place of its parent in the level before, which is the
-        world for the first level.
+    - `parents`: for each node, the place of its parent in the level before. The parent
+        of all nodes in the first level is the world.
     """
 
     nodes: np.ndarray
@@ -341,7 +342,7 @@ class Tree:
     ) -> tuple[Array, Array | None, Array | None]:
         """Compute the body twist (v, ω) of each node, and gravity in its frame.
 
-        The third result is the product of the position with gravity.
+        The third result is the scalar product of each node's position with gravity.
         """
         all_rotations, all_positions = self._relative(q, args)
         all_twists = self._own_twists(v, all_rotations)

@@ -1,6 +1,6 @@
 """The charts in which a step is written: of a vector space, and of a Lie group.
 
-A chart y -> g_o τ(y) maps coordinates to positions by the retraction τ. It carries
+A chart y -> g_o τ(y) maps coordinates to positions by the retraction τ. It transports
 velocities and covectors between its origin g_o and the other positions of a step
 (paper, section 6).
 """
@@ -29,9 +29,10 @@ Vectors: TypeAlias = Float[Array, "r n"]
 class AbstractChart(eqx.Module):
     """The chart y -> g_o τ(y) of a manifold around its origin g_o, for one step.
 
-    The methods carry velocities and covectors from g_o τ(y) to the chart and back
-    (paper, section 6). The origin depends on the kind of chart and on the increment ξ
-    of the step.
+    The methods transport velocities and covectors from g_o τ(y) to the chart and back
+    (paper, section 6). A step starts at g_k, and ξ = h Σ b_j H^j is its increment, with
+    the stage velocities H^j in the chart. The origin depends on ξ and on the kind of
+    chart.
     """
 
     manifold: eqx.AbstractVar[AbstractLieGroup]
@@ -40,7 +41,7 @@ class AbstractChart(eqx.Module):
     def coordinates(self, increment: Vectors) -> Vectors:
         """Compute the coordinates y of the points that increments Ξ reach from g_k.
 
-        The increment ξ reaches the end of the step.
+        The end of the step is the point that the increment ξ reaches.
         """
 
     @property
@@ -76,7 +77,8 @@ class AbstractChart(eqx.Module):
         """Compute (Π, F), the momenta and forces conjugate to the coordinates y.
 
         They are Π = dτ_y^* μ and F = dτ_y^* w + (ddτ_y)^*(H, Π) for body momenta μ and
-        body forces w. The second term of F is the gradient of ⟨μ, dτ_y H⟩ in y.
+        body forces w. The second term of F is the gradient of ⟨μ, dτ_y H⟩ with respect
+        to y.
         """
 
     @abstractmethod
@@ -239,8 +241,8 @@ class AbstractCurvedChart(AbstractChart):
     ) -> tuple[Vector, Vector]:
         """Apply Ad^*_{τ(y)} to a compensated sum; return a compensated sum.
 
-        The rounding errors of plain products with Ad^* would accumulate over the steps,
-        like the rounding errors of plain sums.
+        With products that are rounded as usual, the rounding errors would accumulate
+        over the steps, like the rounding errors of plain sums.
         """
         change = self.manifold.to_end_change(y, momentum)
         return two_sum(momentum, change + self.manifold.to_end(y, compensation))
@@ -363,7 +365,7 @@ _CURVED = {"start": StartChart, "middle": MiddleChart}
 def chart_of_step(
     manifold: AbstractLieGroup, chart: str, start: PyTree[Array], increment: Vector
 ) -> AbstractChart:
-    """Build the chart of a step from g_k.
+    """Build the chart of a step that starts from g_k.
 
     **Arguments:**
 

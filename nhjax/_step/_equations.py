@@ -56,7 +56,8 @@ class StageUnknowns(eqx.Module):
     - `node_fibre_coordinate`: u^2..u^s (v or p) at the nodes. The last node is the end
         of the step. Without nonholonomic constraints there is only u_{k+1}.
     - `closure`: y, the unknowns of the closure. The nonholonomic multipliers are
-        Λ = (start) λ_k + (end) λ_{k+1} + E y.
+        Λ = (start) λ_k + (end) λ_{k+1} + E y, where start, end and E are the constant
+        matrices of `method.closure_weights`.
     - `holonomic`: the holonomic multipliers Λ^1..Λ^s.
     - `end_acceleration`, `end_multiplier`: u̇ and λ_c at the end of the step, which
         only the symmetric closure has.
@@ -78,7 +79,7 @@ class StageUnknowns(eqx.Module):
 class StageForces(NamedTuple):
     """The forces, multipliers and momenta at the stages i = 1..s, with residuals."""
 
-    force: Float[Array, "s n"]  # n^i, the force W^i carried to the origin of the chart
+    force: Float[Array, "s n"]  # n^i, the body force w^i carried to the chart's origin
     multiplier: Float[Array, "s l"]  # Λ^i
     residual: Float[Array, "s n"]  # Π^i - base - h Σ â_ij F^j
     momentum: Float[Array, "s n"]  # Π^i, the scale of the residuals
@@ -87,13 +88,13 @@ class StageForces(NamedTuple):
 class StageEquations(eqx.Module):
     """The discrete equations of one step from (q_k, p_k, λ_k).
 
-    These are the four Summaries of the paper, for the `StageUnknowns` in the chart of
-    the method. Let y^i be the coordinates of stage i in the chart, and Π^i its momentum
-    in the chart. Let w^i be the body force at stage i, including reactions, let
-    n^i = Ad^*_{τ(y^i)⁻¹} w^i be this force carried to the origin of the chart, and F^i
-    the same force in the chart. Let μ^i be the body momentum at node i, and M the
-    momentum μ_k carried to the origin. With `base` from `AbstractChart.base_momentum`,
-    the equations are
+    These are the equations of the four Summaries of the paper, for the `StageUnknowns`
+    in the chart of the method. Let y^i be the coordinates of stage i in the chart, and
+    Π^i its momentum in the chart. Let w^i be the body force at stage i, including
+    reactions, let n^i = Ad^*_{τ(y^i)⁻¹} w^i be this force carried to the origin of the
+    chart, and F^i the same force in the chart. Let μ^i be the body momentum at node i,
+    and M the momentum μ_k carried to the origin. With `base` from
+    `AbstractChart.base_momentum`, the equations are
 
     Π^i = base + h Σ â_ij F^j,    μ^i = Ad^*_{τ(y^i)} (M + h Σ a_ij n^j),
 
@@ -182,7 +183,8 @@ class StageEquations(eqx.Module):
     def hamiltonian(self) -> bool:
         """Return whether the system is Hamiltonian.
 
-        Then the stage momenta are unknowns, in addition to the stage velocities.
+        In a Hamiltonian system the stage momenta are unknowns, in addition to the stage
+        velocities.
         """
         return self.system.fibre_coordinate_name == "p"
 
@@ -219,8 +221,8 @@ class StageEquations(eqx.Module):
     def node_rows(self) -> np.ndarray:
         """Return the rows of a_ij for the nodes at which momenta are computed.
 
-        With nonholonomic constraints these are the nodes i >= 2. Otherwise it is only
-        the end of the step, whose row contains the weights b.
+        With nonholonomic constraints these are the nodes i >= 2. Otherwise the end of
+        the step is the only such node, and its row contains the weights b.
         """
         method = self.method
         return method.a[1:] if self.num_nonholonomic else method.b[None]
@@ -263,7 +265,7 @@ class StageEquations(eqx.Module):
     def _padded(self, weights: str, multiplier: Float[Array, " l"]) -> Array:
         """Compute the part of Λ that comes from a known multiplier, such as λ_k.
 
-        The holonomic multipliers do not depend on it.
+        The holonomic multipliers do not depend on this known multiplier.
         """
         known = multiplier[: self.num_nonholonomic]
         part = jnp.outer(self.closure_weights(weights), known)
@@ -450,7 +452,7 @@ def end_residual(
 ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
     """Compute the residuals of the equations of motion at the end of the step.
 
-    The continuous multiplier λ_c at the end is their root.
+    They vanish for the acceleration and the continuous multiplier λ_c at the end.
     """
     on_momentum, hidden = motion_residual(
         stages.system,
@@ -513,7 +515,7 @@ def _at_nodes(
 
 
 def start_impulse(stages: StageEquations, x: StageUnknowns) -> Float[Array, " n"]:
-    """Compute the impulse ε ω_k at the start of a step."""
+    """Compute the impulse ε ω_k at the start of a step; see `Directions` for ω."""
     assert stages.invariants is not None
     return small_einsum("k,kn->n", x.impulse, stages.invariants.covectors)
 
@@ -526,7 +528,7 @@ def start_momentum(stages: StageEquations, x: StageUnknowns) -> Float[Array, " n
 
 
 def end_impulse(stages: StageEquations, x: StageUnknowns) -> Float[Array, " n"]:
-    """Compute the impulse ε ω_{k+1} at the end of the step."""
+    """Compute the impulse ε ω_{k+1} at the end of the step; see `Directions` for ω."""
     _, covectors = end_slopes(stages, x)
     return small_einsum("k,kn->n", x.impulse, covectors)
 
@@ -682,7 +684,7 @@ def stage_residuals(
     if stages.end_multiplier_is_unknown:
         end = end_residual(stages, x)
     if stages.invariants is not None:
-        # This is the equation that simplified Newton solves.
+        # Simplified Newton solves the same equation for the impulses.
         weights = stop_gradient(invariant_correction(stages, x))
         impulse = -weights.change(x.impulse, invariant_errors(stages, x))
     given = forces.residual, r_nodes, velocity, kinematic, holonomic, end, impulse

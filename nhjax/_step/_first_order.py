@@ -1,11 +1,11 @@
 """The terms of order h in the Jacobian of the stage equations, and when to use them.
 
-With the mass matrix and the constraints at the start of the step alone, simplified
-Newton reduces the error by a factor O(h) an iteration. With `FirstOrderTerms` the
-factor is O(h²): they add the change of the mass matrix along the step, and the
-derivatives of momenta with respect to positions and of forces with respect to
-velocities. `uses_first_order_terms` decides whether these terms are available and
-whether they make a step faster.
+If simplified Newton uses only the mass matrix and the constraints at the start of the
+step, it reduces the error by a factor O(h) an iteration. With `FirstOrderTerms` the
+factor is O(h²). These terms are the change of the mass matrix along the step, the
+derivatives of momenta with respect to positions, and the derivatives of forces with
+respect to velocities. `uses_first_order_terms` decides whether these terms are
+available and whether they make a step faster.
 """
 
 from typing import Literal, NamedTuple, TypeAlias
@@ -25,10 +25,11 @@ from ._equations import StageEquations, StageUnknowns
 # of "leading" and "first_order".
 JacobianName: TypeAlias = Literal["leading", "first_order", "full"] | None
 
-# The terms are worthwhile if the saved iterations cost more time than the terms: up to
-# this many stages, coordinates, and entries of the responses of stages to multipliers,
-# and without holonomic constraints. Larger programs of one trajectory are no longer
-# compiled as scalars, and become several times slower.
+# The terms make a step faster if the saved iterations cost more time than the terms.
+# This is so up to these numbers of stages, of coordinates, and of entries of the
+# responses of stages to multipliers, and without holonomic constraints. The larger
+# program of a larger system is no longer compiled to scalar operations if it computes
+# one trajectory, and is then several times slower.
 _MOST_STAGES, _MOST_COORDINATES, _MOST_RESPONSES = 5, 6, 100
 
 
@@ -77,9 +78,9 @@ def has_force_slopes(
 ) -> bool:
     """Return whether forces have forward-mode derivatives in the velocities.
 
-    Callbacks do not have them, nor do functions whose custom derivative rule is for
-    reverse mode only. Simplified Newton with the leading part of the Jacobian does not
-    need these derivatives.
+    Callbacks do not have such derivatives, and neither do functions whose custom
+    derivative rule is for reverse mode only. Simplified Newton with the leading part of
+    the Jacobian does not need these derivatives.
     """
 
     def force(u):
@@ -117,9 +118,10 @@ class FirstOrderTerms(eqx.Module):
 
     and the equations of the nodes change in the same form. The leading part is N δH_i
     with the mass matrix N at the start of the step. All other terms are of order h: the
-    change of the mass matrix until the stage, N_i = N + h c_i Ṅ, the change of momenta
-    with positions, and the change of forces with velocities. Their derivatives are
-    taken at the start of the step and multiplied by N⁻¹, so that with z_i = N⁻¹ r_i
+    change of the mass matrix from the start to the stage, N_i = N + h c_i Ṅ, the change
+    of momenta with positions, and the change of forces with velocities. Their
+    derivatives are taken at the start of the step and multiplied by N⁻¹, so that with
+    z_i = N⁻¹ r_i
 
     δH_i = z_i - N⁻¹ (the terms, applied to z),
 
@@ -156,7 +158,7 @@ class FirstOrderTerms(eqx.Module):
     def by_force(
         self, stages: StageEquations, change: Float[Array, "s n *c"]
     ) -> Float[Array, "r n *c"]:
-        """Compute the part of the changes of node velocities that is due to forces.
+        """Compute the changes of node velocities that are due to forces.
 
         `change` is the change of the stage velocities.
         """
@@ -165,16 +167,17 @@ class FirstOrderTerms(eqx.Module):
     def by_position(
         self, stages: StageEquations, change: Float[Array, "s n *c"]
     ) -> Float[Array, "r n *c"]:
-        """Compute the part of the changes of node velocities that is due to positions.
+        """Compute the changes of node velocities that are due to positions.
 
         `change` is the change of the stage velocities.
         """
         return -_times(self.node_momentum, _weighted(stages.node_weights, change))
 
 
-# If the size of h N⁻¹ ∂F/∂H is larger than this, the series does not converge. An
-# example is friction that is steep at rest. The leading part alone then converges
-# better, in particular if the friction saturates at a low velocity.
+# If the size of h N⁻¹ ∂F/∂H is larger than this, the Neumann series of
+# `FirstOrderTerms` does not converge. An example is friction that changes steeply near
+# rest. The leading part of the Jacobian alone then converges better, in particular if
+# the friction saturates at a low velocity.
 _LARGEST = 5.0
 
 
@@ -319,8 +322,9 @@ def _coordinates(stages: StageEquations, x: StageUnknowns, u: Array) -> _ChartSl
     force, body_force = full_jacobian(lambda v: pair(zero, zero, v)[1:], u)
     of_base = full_jacobian(base, stages.increment(x))
     if stages.method.chart == "middle":
-        # The coordinates of all points move by -½ δξ. Both ends contribute the same
-        # forces to the constant term.
+        # A change δξ of the increment moves the coordinates of all points by -½ δξ,
+        # because the origin lies in the middle. Both ends contribute the same forces to
+        # the constant term.
         of_base = of_base + 0.5 * slope + 0.5 * (body_force - force)
     else:
         of_base = of_base + body_force - force

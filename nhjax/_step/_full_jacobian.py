@@ -34,7 +34,7 @@ from ._equations import (
 
 
 class StageResponses(NamedTuple):
-    """The changes of stages and nodes by a change of the multipliers."""
+    """The changes of stages and nodes that a change of the multipliers causes."""
 
     velocity: Float[Array, "s n"]
     momentum: Float[Array, "s p"]
@@ -44,8 +44,10 @@ class StageResponses(NamedTuple):
 class Slopes(NamedTuple):
     """The derivatives of quantities of the stages with respect to H, Ξ and ξ.
 
-    Row i of a quantity depends on H_i and Ξ_i of the same row, and on ξ. On a vector
-    space it does not depend on ξ, and `by_xi` is None.
+    H are the stage velocities, Ξ the increments from the start of the step to the
+    stages, and ξ is the increment of the whole step. Row i of a quantity depends on H_i
+    and Ξ_i of the same row, and on ξ. On a vector space the quantity does not depend on
+    ξ, and `by_xi` is None.
     """
 
     by_velocity: Float[Array, "s n n"]
@@ -111,7 +113,7 @@ class LinearisedStep(eqx.Module):
     def of_stages(
         self, stages: StageEquations, residual: Float[Array, "s n"]
     ) -> tuple[Float[Array, "s n"], Float[Array, "s p"]]:
-        """Compute the δH and δμ that change the residuals of the stages as given."""
+        """Compute the δH and δμ that change the stage residuals by `residual`."""
         velocity = _block_product(self.stages, residual)
         if self.conjugate is None:
             return velocity, jnp.zeros_like(velocity[:, :0])
@@ -120,7 +122,7 @@ class LinearisedStep(eqx.Module):
     def by_force(
         self, stages: StageEquations, change: Float[Array, "s n"]
     ) -> Float[Array, "r n"]:
-        """Compute the changes of the momenta at the nodes by forces, given δH."""
+        """Compute the changes of the node momenta that forces cause, given δH."""
         force = self.transported.along(*_moves(stages, change))
         gained = stages.h * _weighted(stages.node_weights, force)
         return gained if self.node_gain is None else _times(self.node_gain, gained)
@@ -128,7 +130,7 @@ class LinearisedStep(eqx.Module):
     def by_position(
         self, stages: StageEquations, change: Float[Array, "s n"]
     ) -> Float[Array, "r n"]:
-        """Compute the changes of the residuals of the nodes by positions, given δH."""
+        """Compute the changes of node residuals due to moved positions, given δH."""
         moved = stages.h * _weighted(stages.node_weights, change)
         moved = _times(self.node_position, moved)
         if self.node_xi is None:
@@ -155,7 +157,7 @@ class LinearisedStep(eqx.Module):
         x: StageUnknowns,
         reaction: Float[Array, "s n"],
     ) -> StageResponses:
-        """Compute how stages and nodes change by given reactions, for h = 1."""
+        """Compute the changes of stages and nodes due to given reactions, for h = 1."""
         on_stages, on_nodes = momenta_of_forces(stages, x, reaction[..., None])
         on_stages, on_nodes = on_stages[..., 0], on_nodes[..., 0]
         velocity, momentum = self.of_stages(stages, on_stages)
@@ -197,8 +199,8 @@ def _products(
 def _block_product(
     matrix: Float[Array, "r k s n"], z: Float[Array, "s n"]
 ) -> Float[Array, "r k"]:
-    # The loop computes row by row. Without it, the product would be unrolled, and would
-    # be the largest part of the program.
+    # The loop computes the product row by row. Without the loop, the product would be
+    # unrolled, and would be the largest part of the program.
     rows = matrix.reshape(-1, *matrix.shape[2:])
     found = jax.lax.map(lambda row: small_einsum("jn,jn->", row, z), rows)
     return found.reshape(matrix.shape[:2])
@@ -210,7 +212,8 @@ def slopes(
     """Evaluate a function of rows, and differentiate it in each of its arguments.
 
     Row i of a result depends only on row i of each argument. Therefore one directional
-    derivative serves for all rows. All rows depend on an argument with a single axis.
+    derivative serves for all rows. An argument with a single axis is shared by all
+    rows.
 
     **Returns:** the values, and for each argument the derivatives, whose last axis
     lists the components of the argument.
@@ -231,7 +234,8 @@ def slopes(
     # This is a loop over the directions, so that the program has one copy of the
     # linearised function.
     found = mapped(along, jnp.eye(sum(sizes), dtype=args[0].dtype))
-    # A derivative can be infinite or NaN, such as the derivative of |v| at rest.
+    # A derivative can be infinite or NaN, such as the derivative of |v| at rest. It is
+    # then replaced by zero.
     found = jax.tree.map(lambda x: jnp.where(jnp.isfinite(x), x, 0), found)
 
     def columns(first, last):
@@ -563,7 +567,9 @@ def inverse_of_schur(
 ) -> Float[Array, "c c"]:
     """Invert the Schur complement of the multipliers, by blocks of constraints.
 
-    The first `num_kinematic` unknowns form blocks of m, the others form blocks of k.
+    The first `num_kinematic` unknowns form blocks of size m, the number of nonholonomic
+    constraints. The other unknowns form blocks of size k, the number of holonomic
+    constraints.
     """
     sizes = stages.num_nonholonomic, stages.num_holonomic
 

@@ -140,8 +140,8 @@ class Invariants(eqx.Module):
     ) -> Float[Array, " k"]:
         """Estimate the sizes of the terms of I, to which its round-off is proportional.
 
-        Position terms are included: the coordinates of a rolling wheel grow without
-        bound.
+        Position terms are included, because the coordinates of a rolling wheel grow
+        without bound.
         """
         found = jnp.abs(self.value) + moving_part(slopes, u)
         by_position = jax.jacrev(
@@ -179,7 +179,7 @@ class Directions(NamedTuple):
 
     - `slopes`: ∂I/∂u - Bᵀ μ, which is ∂I/∂u without its part along the reactions.
     - `covectors`: ω, the slopes as covectors, which are the directions.
-    - `multipliers`: μ = C⁻¹ B M⁻¹ ∂I/∂v; None if μ = 0 without computation.
+    - `multipliers`: μ = C⁻¹ B M⁻¹ ∂I/∂v; None if μ is known to be zero.
     """
 
     slopes: Float[Array, "k n"]
@@ -193,7 +193,8 @@ class InvariantsAtStart(eqx.Module):
     - `functions`: the functions, and the values that are kept.
     - `slopes`, `covectors`: ∂I/∂u and ω = ∂I/∂v at the start.
     - `momentum_inverse`: N⁻¹, which maps momenta to fibre coordinates.
-    - `row_sums`: Σ_j |K⁻¹_ij|, the diagonal matrix D with |ω·K⁻¹ω| <= ω·Dω.
+    - `row_sums`: Σ_j |K⁻¹_ij|, the entries of a diagonal matrix D with
+        |ω·K⁻¹ω| <= ω·Dω.
     - `moving`: Σ |u ∂I/∂u| at the start; for the energy usually twice the kinetic
         energy.
     - `sizes`: the sizes of the terms of the invariants, to which their round-off is

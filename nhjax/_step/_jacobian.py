@@ -90,9 +90,9 @@ def simplified_newton_update(
     change = x_next.velocity - x.velocity
     x_next = factors.correct_nodes(stages, x_next, r_nodes, change)
     if stages.invariants is not None:
-        # The impulses come before the constraints, so that the constraints are
-        # evaluated with the change by the impulses. If a system is nearly at rest, the
-        # work of the reactions on this change is not negligible.
+        # The impulses are corrected before the constraints, so that the constraints are
+        # evaluated after the impulses have changed the unknowns. If a system is nearly
+        # at rest, the work of the reactions on this change is not negligible.
         error = invariant_errors(stages, x_next)
         x_next = factors.correct_impulses(stages, x_next, error)
     if factors.full is not None:
@@ -283,7 +283,7 @@ class NewtonFactors(eqx.Module):
     If the run keeps invariants, the impulses are eliminated last. Row k of `impulses`
     is a change of all unknowns with a unit impulse for invariant k. This change leaves
     all residuals the same, except the residuals of the equations for the impulses. The
-    changes of the latter form a matrix, whose inverse is `schur_inverse`. Without
+    changes of these residuals form a matrix, whose inverse is `schur_inverse`. Without
     invariants `impulses` and `schur_inverse` are None.
     """
 
@@ -348,12 +348,13 @@ class StageJacobianFactors(eqx.Module):
     the positions, and B_s δu_s = -r for the rate of the holonomic constraints at the
     end of the step. These three conditions give a Schur complement for the unknowns
     h δy of the closure and h δΛ of the holonomic constraints. For small h it is
-    invertible by hypothesis H2 (for the symmetric closure by the sign of ν) and the
-    compatibility condition.
+    invertible by hypothesis H2 and the compatibility condition, for the symmetric
+    closure also by the sign of its unknown ν; see `docs/closures.md`.
 
     With `first_order`, the terms of order h are added to N⁻¹ r. The changes of the
     unknowns with the multipliers are then the `responses`, which include these terms.
-    With `full`, the factors of the full Jacobian replace all others but `impulses`.
+    With `full`, the factors of the full Jacobian replace all other fields except
+    `impulses`.
     """
 
     momentum_inverse: SquareMatrix
@@ -908,7 +909,8 @@ def increment_size(
         # changes of u itself: Λ can still be wrong where the stages and nodes happen to
         # be right.
         before, after = map(stages.multiplier_change, (x, x_next))
-        # With one constraint, this matrix is replaced by its largest entry.
+        # With one constraint, the matrix has one column. Its largest entry gives the
+        # same norm for less work.
         reaction = lin.reaction.max_norm_equivalent()
         changes.append(stages.h * reaction.matvec(after - before))
     size = max_norm(*changes)

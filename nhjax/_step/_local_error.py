@@ -44,10 +44,10 @@ from .._system import AbstractMechanicalSystem
 from ._step import StepOutcome, StepState
 
 
-# The error of a step is the error of the quadrature b times `_GROWTH` to the power
-# p + 1 - s, the number of orders that the samples do not determine. The factor a is
-# `_GROWTH_BY_COMMUTATOR` times the eigenvalue of ad(h v). Both values were fitted to
-# the errors of steps of the gallery (`benchmarks.adaptive_steps`).
+# The error of a step is the error of the quadrature with the weights b, times `_GROWTH`
+# to the power p + 1 - s, the number of orders that the samples do not determine. The
+# factor a is `_GROWTH_BY_COMMUTATOR` times the eigenvalue of ad(h v). Both values were
+# fitted to the errors of steps of the gallery (`benchmarks.adaptive_steps`).
 _GROWTH, _GROWTH_BY_COMMUTATOR = 2.8, 1.2
 # Velocities in a chart also change because of the chart. Therefore their derivatives
 # are multiplied by this factor, which was fitted in the same way.
@@ -70,7 +70,7 @@ def local_error(
     **Arguments:**
 
     - `t`, `h`: the start and the size of the step.
-    - `start`, `outcome`: the state before the step, and its outcome.
+    - `start`, `outcome`: the state before the step, and the outcome of the step.
     - `scales`: the sizes that count as an error of one, for the n coordinates of a
         displacement in q and for the n fibre coordinates.
     - `growth_rates`: r / h of earlier steps, for u and for q; infinite if unknown.
@@ -108,7 +108,8 @@ def local_error(
                 lambda u: system.velocity(t, start.state.q, u, args), (u,), (change,)
             )
         )(changes)
-    # The step back has the same velocities in reverse order, and so the same mean.
+    # The mean of the stage velocities is the same for the step back, which has the same
+    # velocities in reverse order.
     mean = jnp.asarray(method.b, h.dtype) @ outcome.record.velocity
     by_chart = _growth_in_chart(system.manifold_of(start.state.q), h * mean)
     # The derivative of order k + 1 of q is the derivative of order k of the velocity.
@@ -166,7 +167,7 @@ def _extrapolated(
     by_chart: FloatScalar | None,
     known_growth: FloatScalar,
 ) -> tuple[FloatScalar, FloatScalar]:
-    """Estimate the size of a derivative from scaled derivatives of orders 1, ..., s.
+    """Estimate the size of a higher derivative from derivatives of orders 1, ..., s.
 
     **Returns:** the size, and the growth r from order to order.
     """

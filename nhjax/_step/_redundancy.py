@@ -13,22 +13,22 @@ from .._system import Linearisation
 class Redundancy(eqx.Module):
     """The equations for the multipliers of redundant constraints.
 
-    With C at the start of the step and C⁻ its least-norm inverse, P = C C⁻ projects the
-    values of the constraints onto the range of C. The dimension of this range is the
-    number of independent constraints. Near the start of the step P Φ = 0 only
-    where Φ = 0. The remaining equations are replaced by
+    With the Delassus matrix C at the start of the step and its least-norm inverse C⁻,
+    P = C C⁻ projects the values of the constraints onto the range of C. The dimension
+    of this range is the number of independent constraints. Near the start of the step
+    P Φ = 0 only where Φ = 0. The remaining equations are replaced by
 
     (1 - P) diag(C) h δΛ = 0,
 
     so that the multipliers keep the least norm, up to the change of the derivatives
     within the step.
 
-    P must not mix the two kinds of constraints. Nonholonomic constraints are imposed at
-    the nodes. Holonomic constraints are imposed at the stages, where their rates do not
-    vanish. Therefore P is block diagonal, with the first and the last diagonal block of
-    C C⁻. A combination of nonholonomic constraints that follows from holonomic ones is
-    among the remaining equations. At the end of the step both kinds hold, and so do all
-    equations that follow from them.
+    P must not mix nonholonomic and holonomic constraints. Nonholonomic constraints are
+    imposed at the nodes. Holonomic constraints are imposed at the stages, where their
+    rates do not vanish. Therefore P is block diagonal, with the first and the last
+    diagonal block of C C⁻. If a combination of nonholonomic constraints follows from
+    holonomic ones, it is among the remaining equations. At the end of the step both
+    kinds of constraints hold, and so do all equations that follow from them.
     """
 
     projector: Float[Array, "l l"]  # P
@@ -46,7 +46,8 @@ class Redundancy(eqx.Module):
         projector = jax.scipy.linalg.block_diag(whole[:m, :m], whole[m:, m:])
         unit = jnp.eye(projector.shape[0], dtype=projector.dtype)
         sizes = jnp.sum(jnp.abs(delassus) * unit, axis=1)
-        # A constraint whose derivatives are zero gives its multiplier no unit.
+        # If the derivatives of a constraint are zero, they give no size for the
+        # equation of its multiplier. The size one is then used.
         sizes = jnp.where(sizes > 0, sizes, 1)
         return cls(projector, (unit - projector) * sizes[None, :])
 

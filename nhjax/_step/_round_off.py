@@ -87,13 +87,13 @@ def round_off_of_steps(
 def magnifications(method: AbstractMethod) -> tuple[float, float]:
     """Compute how much a step magnifies random errors of its constraints.
 
-    The change h N⁻¹ R δΛ is larger, by this factor, than the change that would correct
-    the error of a single constraint. The factor is the largest Euclidean norm of a row
-    of E (A_{2:} E)⁻¹ for nonholonomic constraints, and of the inverse of the matrix
-    with the rows A_{2:} Â and b for holonomic constraints. A_{2:} is A without its
-    first row, and E belongs to the closure of the multiplier. Pseudo-inverses are used,
-    because a method that does not support one of the two kinds of constraints can have
-    a singular matrix.
+    The change h N⁻¹ R δΛ in a step is larger, by the computed factor, than the change
+    that would correct the error of a single constraint. The factor is the largest
+    Euclidean norm of a row of E (A_{2:} E)⁻¹ for nonholonomic constraints, and of the
+    inverse of the matrix with the rows A_{2:} Â and b for holonomic constraints. A_{2:}
+    is A without its first row, and E belongs to the closure of the multiplier.
+    Pseudo-inverses are used, because a method that does not support one of the two
+    kinds of constraints can have a singular matrix.
 
     **Returns:** the factor for nonholonomic and the factor for holonomic constraints.
     """

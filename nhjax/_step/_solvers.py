@@ -1,6 +1,7 @@
 """The solvers of the stage equations, simplified Newton and Newton's method.
 
-Both stop when their increments are round-off, relative to the scale of the step.
+Both solvers stop when the changes of their iterates are round-off, relative to the
+scale of the step.
 """
 
 from collections.abc import Callable
@@ -56,9 +57,11 @@ from ._step import AbstractStageSolver, FrozenNewtonMap
 # If N⁻¹ times the residual is larger than this, relative to the fibre coordinates, the
 # iterate is not a solution.
 _GROSS = 1e-6
-# For larger systems, Newton's method calls `jnp.linalg.solve`.
+# For systems with more coordinates, or steps with more unknowns, Newton's method calls
+# `jnp.linalg.solve`.
 _MOST_COORDINATES, _MOST_UNKNOWNS = 32, 256
-# After this many iterations of simplified Newton, the fallback is faster.
+# After this many iterations of simplified Newton, the fallback to Newton's method takes
+# less time than further iterations.
 _MOST_BEFORE_NEWTON = 100
 
 
@@ -96,14 +99,14 @@ class SimplifiedNewton(AbstractStageSolver):
     iterations.
 
     If simplified Newton does not converge, Newton's method with the exact Jacobian may
-    still converge. With the fallback, Newton's method takes over in such a step, and
-    `Solution.stats["num_newton_steps"]` counts these steps. A program that contains
-    both methods takes about three times as long to compile. For this reason a plain
-    call of `integrate`, outside all transformations of JAX, first runs without the
-    fallback. If a step was not solved, the call repeats the run with the full Jacobian.
-    If that does not help, the call repeats the run with the fallback. In your own
-    transformed program (`jax.jit`, `jax.vmap`, `jax.grad`), a step that is not solved
-    ends the run, unless you request the full Jacobian or the fallback.
+    still converge. With the option `fallback`, Newton's method takes over in such a
+    step, and `Solution.stats["num_newton_steps"]` counts these steps. A program that
+    contains both methods takes about three times as long to compile. For this reason a
+    plain call of `integrate`, outside all transformations of JAX, first runs without
+    the fallback. If a step was not solved, the call repeats the run with the full
+    Jacobian. If a step is still not solved, the call repeats the run with the fallback.
+    In your own transformed program (`jax.jit`, `jax.vmap`, `jax.grad`), a step that is
+    not solved ends the run, unless you request the full Jacobian or the fallback.
 
     **Arguments:**
 
@@ -113,10 +116,12 @@ class SimplifiedNewton(AbstractStageSolver):
         stop. The default, 0, iterates to round-off. Changing the tolerance does not
         recompile.
     - `fallback`: whether `nhjax.Newton()` takes over a step that is not solved: True,
-        False, or None, the default, which means only in plain calls. Derivatives of a
-        run with the fallback use the exact Jacobian, as with `nhjax.Newton()`.
+        False, or None. None, the default, uses the fallback only in plain calls, as
+        described above. Derivatives of a run with the fallback use the exact Jacobian,
+        as with `nhjax.Newton()`.
     - `jacobian`: the part of the Jacobian that is used.
-        - `"leading"`, or `"first_order"`, which includes the terms of order h.
+        - `"leading"`, the leading part alone, or `"first_order"`, the leading part with
+            the terms of order h.
         - `"full"`, the full Jacobian, for machines whose steps need many iterations or
             are not solved.
         - None, the default: the terms of order h are included if they reduce the run
@@ -317,7 +322,7 @@ def _solved(
     push: Linearised,
     rights: list[StageResiduals],
 ) -> Float[Array, "r k"]:
-    """Solve the linearised equations J dx = r of a step for some residuals r.
+    """Solve the linearised equations J dx = r of a step for each r in `rights`.
 
     `push` multiplies by J. The equations are eliminated by blocks, with one round of
     refinement for the first r. Rows are not exchanged between blocks, so that the

@@ -507,8 +507,8 @@ def error_ratios(
         gained = h * small_einsum("s,sn->n", weights, force)
         return moved, lin.momentum_inverse.matvec(gained)
 
-    # The floor is the round-off of u, because a difference of this size contains no
-    # information about the error.
+    # The divisor is increased by the round-off of u, because a difference of this size
+    # contains no information about the error.
     size = max_norm(u)
     if stages.round_off is not None:
         size = jnp.maximum(size, stages.round_off.size(jnp.abs(h)))

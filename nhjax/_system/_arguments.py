@@ -29,7 +29,7 @@ Kind: TypeAlias = type | tuple[type, ...]
 
 
 def check_type(name: str, x: object, kind: Kind, advice: str = "") -> None:
-    """Raise a `TypeError` unless `x` is an instance of `kind`, a type or a tuple."""
+    """Raise a `TypeError` unless `x` is an instance of `kind`, a type or several."""
     if isinstance(x, kind):
         return
     if isinstance(x, type):
@@ -185,7 +185,8 @@ def parameter(value: ArrayLike) -> Array:
 def parameters(args: Args) -> Args:
     """Convert the floats in `args` to arrays, so that changing them does not recompile.
 
-    Other values are compiled in. A `TypeError` is raised if one is not hashable.
+    Other values are compiled in. A `TypeError` is raised if such a value is not
+    hashable.
     """
 
     def leaf(path, x):
@@ -222,8 +223,8 @@ def check_signature(
 ) -> None:
     """Raise a `TypeError` unless a user's function takes `arguments`.
 
-    The function is called by position, so its arguments may have other names. It is
-    refused if expected names are interchanged.
+    The function is called by position, so its arguments may have other names. A
+    function in which expected names are interchanged is refused.
 
     **Arguments:**
 
@@ -319,7 +320,7 @@ def takes_multipliers(force: Any) -> bool:
 
 
 def check_constraints(owner: Any) -> None:
-    """Raise a `ValueError` unless the option `constraints` of `owner` is possible."""
+    """Raise a `ValueError` unless the option `constraints` of `owner` is known."""
     name = f"{type(owner).__name__}: `constraints`"
     check_choice(name, owner.constraints, ("independent", "redundant"))
     if owner.constraints == "redundant" and owner.force_takes_multipliers:

@@ -51,18 +51,18 @@ _LARGEST_BLOCK = 1 / 4
 class Linearisation(eqx.Module):
     """The equations of motion, linearised at one state (t, q, u), and their solution.
 
-    u is the fibre coordinate of the system, v or p. With N = ∂p/∂u, the Jacobian
-    B = ∂Φ/∂u of the constraints on velocities, and the reactions R = ♭ Bᵀ, the motion
-    satisfies
+    u is the fibre coordinate of the system, v or p. The free force is the force without
+    the reactions of the constraints. With N = ∂p/∂u, the Jacobian B = ∂Φ/∂u of the
+    constraints on velocities, and the reactions R = ♭ Bᵀ, the motion satisfies
 
     N u̇ - R λ = ad*_v p + free force - ∂t p - D1p v,    B u̇ = -∂t Φ - D1Φ v.
 
     These equations determine C λ, and therefore the multiplier λ. Here C = B N⁻¹ R is
     the Delassus matrix, which the paper calls the compatibility matrix C^{ab} (section
     3). For a Lagrangian system N is the mass matrix M = D2D2L, R = Bᵀ, and u̇ is the
-    acceleration. For a Hamiltonian system N = 1 and R = (D2D2H)⁻¹ Bᵀ. In both cases N⁻¹
-    R = K⁻¹ Bᵀ with the fibre Hessian K = D2D2L or D2D2H. If the force depends on the
-    multipliers, R includes ∂F/∂λ.
+    acceleration. For a Hamiltonian system N = 1 and R = (D2D2H)⁻¹ Bᵀ. In both cases
+    N⁻¹ R = K⁻¹ Bᵀ with the fibre Hessian K = D2D2L or D2D2H. If the force depends on
+    the multipliers, R includes ∂F/∂λ.
 
     The Jacobian of the stage equations has the same matrices. Inverses are computed
     once, and later computations multiply by them: the matrices are tiny, and a
@@ -107,7 +107,7 @@ class Linearisation(eqx.Module):
 
     @property
     def is_unique(self) -> Bool[Array, " l"]:
-        """Return which multipliers are unique: all, without redundant constraints."""
+        """Return which multipliers are unique: all if no constraints are redundant."""
         if not self.is_redundant:
             return jnp.ones(self.violation.shape, bool)
         # The product C C⁻ projects onto the range of C.
@@ -379,8 +379,8 @@ def continuous_multiplier(
 
     It follows from the hidden constraint dΦ/dt = 0, and for holonomic constraints,
     whose rows come last, from d²Γ/dt² = 0 (the paper's section 3). Along a trajectory
-    of a Lobatto method it has order 2s-2, while the multiplier that the paper
-    propagates has order s or s-1.
+    of a Lobatto method with s stages, this multiplier has order 2s-2, while the
+    multiplier that the paper propagates has order s or s-1.
 
     **Arguments:**
 

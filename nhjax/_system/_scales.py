@@ -35,7 +35,7 @@ def violation_scale(
     u: Float[Array, " n"],
     args: Args,
 ) -> Float[Array, " l"]:
-    """Estimate, row by row, how large the terms of Φ are for a u of the given size.
+    """Estimate the sizes of the terms of each row of Φ, for any u of the same size.
 
     The estimate treats Φ as affine in u. It is not the size of the terms at u itself: a
     constraint such as v[1] has a single term, which is round-off in every state that
@@ -61,7 +61,7 @@ def velocity_scale(
 def position_scale(
     system: AbstractMechanicalSystem, t: FloatScalar, q: PyTree[Array], args: Args
 ) -> Float[Array, " k"]:
-    """Estimate, row by row, how large the terms of Γ are for a q of the given size.
+    """Estimate the sizes of the terms of each row of Γ, for any q of the same size.
 
     The estimate treats Γ as affine in q. It is not the size of the terms at q itself;
     see `violation_scale`. If q is zero, its size is taken as one.
@@ -217,10 +217,10 @@ def noise_near(
     """Measure the round-off of a function of (t, q, u) near a state.
 
     `dt` is a time step that resolves the motion. If `dt` is shorter than the unit of
-    time, times are displaced in units of `dt`, because a drive can be fast. If `dt` is
-    longer, velocities and momenta are displaced in units of 1 / `dt`, because the
-    motion can be slow. `like` has the structure, shapes and dtype of the results; see
-    `measured_noise`.
+    time, times are displaced in units of `dt`, because prescribed motions can be fast.
+    If `dt` is longer, velocities and momenta are displaced in units of 1 / `dt`,
+    because the motion can be slow. `like` has the structure, shapes and dtype of the
+    results; see `measured_noise`.
     """
     (t, q, u, dt), n = stop_gradient((t, q, u, dt)), u.shape[0]
     dt = jnp.abs(dt)

@@ -2,8 +2,8 @@
 
 A system is written on TQ or on T*Q: its state has a position q and a fibre coordinate
 u, which is the velocity v of a Lagrangian and the momentum p of a Hamiltonian system.
-All rooms above this one (`docs/rooms.md`) use only the common interface of both kinds,
-`AbstractMechanicalSystem`.
+`_initial`, `_step` and `_integrate` use only the common interface of both kinds of
+systems, `AbstractMechanicalSystem`.
 """
 
 from abc import abstractmethod
@@ -147,11 +147,11 @@ class AbstractOfSystem(eqx.Module):
 class AbstractMechanicalSystem(eqx.Module):
     """A mechanical system with constraints, written on TQ or on T*Q.
 
-    The two kinds differ in the fibre coordinate u, which is the velocity of a
-    Lagrangian and the momentum of a Hamiltonian system. Both kinds provide the
-    functions `velocity`, `momentum`, `conservative_force`, `constraint` and `metric` of
-    (t, q, u). The equations of a step use only these functions, and `free_force`, which
-    may depend on the multipliers too.
+    Lagrangian and Hamiltonian systems differ in the fibre coordinate u, which is the
+    velocity of a Lagrangian and the momentum of a Hamiltonian system. Both kinds
+    provide the functions `velocity`, `momentum`, `conservative_force`, `constraint` and
+    `metric` of (t, q, u). The equations of a step use only these functions, and
+    `free_force`, which may depend on the multipliers too.
     """
 
     nonholonomic: eqx.AbstractVar[PhaseFunction | None]
@@ -425,8 +425,8 @@ class LagrangianSystem(AbstractMechanicalSystem):
     Automatic differentiation computes all derivatives. If a function is an
     `equinox.Module`, its array leaves are parameters of the system, and gradients with
     respect to the system include them. A system can be an argument of `jax.jit`,
-    `jax.vmap` and `jax.grad`: Python functions are a part of its structure, and another
-    function recompiles.
+    `jax.vmap` and `jax.grad`: Python functions are a part of its structure, and a
+    system with another function recompiles.
 
     Values that the functions read besides their arguments (globals, variables of
     enclosing functions, attributes of objects) are compiled in. `integrate` and
@@ -452,12 +452,12 @@ class LagrangianSystem(AbstractMechanicalSystem):
     - `manifold`: the configuration manifold; by default R^n with the n of the state.
     - `constraints`: `"independent"` refuses dependent constraints. `"redundant"` allows
         constraints that follow from others, also nonholonomic constraints that follow
-        from holonomic ones. Many multipliers then have the same reaction. The result
-        has the multipliers with the least Σ |λ_a B_a|², where |λ_a B_a| is the size of
-        the reaction of one constraint in the metric M⁻¹. The multiplier of a
-        nonholonomic constraint is zero if the constraint follows from holonomic
-        constraints. Reactions are marked as not unique. `docs/systems.md` has the
-        details.
+        from holonomic ones. Many multipliers then have the same reaction. nhjax chooses
+        the multipliers with the least Σ |λ_a B_a|², where |λ_a B_a| is the size of the
+        reaction of one constraint in the metric M⁻¹. The multiplier of a nonholonomic
+        constraint is zero if the constraint follows from holonomic constraints.
+        `nhjax.Motion.is_unique` says which multipliers the equations determine.
+        `docs/systems.md` has the details.
     - `coordinates`: a tuple of the names of the n coordinates, for
         `Solution.to_xarray` and for `keep_q`, `keep_v` and `keep_p` of `initial_state`;
         None by default.
@@ -597,12 +597,12 @@ class HamiltonianSystem(AbstractMechanicalSystem):
     - `manifold`: the configuration manifold; by default R^n with the n of the state.
     - `constraints`: `"independent"` refuses dependent constraints. `"redundant"` allows
         constraints that follow from others, also nonholonomic constraints that follow
-        from holonomic ones. Many multipliers then have the same reaction. The result
-        has the multipliers with the least Σ |λ_a B_a|², where |λ_a B_a| is the size of
-        the reaction of one constraint in the metric M⁻¹. The multiplier of a
-        nonholonomic constraint is zero if the constraint follows from holonomic
-        constraints. Reactions are marked as not unique. `docs/systems.md` has the
-        details.
+        from holonomic ones. Many multipliers then have the same reaction. nhjax chooses
+        the multipliers with the least Σ |λ_a B_a|², where |λ_a B_a| is the size of the
+        reaction of one constraint in the metric M⁻¹. The multiplier of a nonholonomic
+        constraint is zero if the constraint follows from holonomic constraints.
+        `nhjax.Motion.is_unique` says which multipliers the equations determine.
+        `docs/systems.md` has the details.
     - `coordinates`: a tuple of the names of the n coordinates, for
         `Solution.to_xarray` and for `keep_q`, `keep_v` and `keep_p` of `initial_state`;
         None by default.
@@ -733,9 +733,10 @@ def with_frames(system: S, q: PyTree[Array]) -> tuple[S, PyTree[Array]]:
     """Return the system and the configuration q with precomputed frames.
 
     A frame holds the sine and cosine of an angle. With it, the methods of the system
-    rotate vectors between body and plane without trigonometric functions. They accept
-    positions with and without frames; the user's functions receive positions without
-    frames. On a manifold without frames the system and q are returned unchanged.
+    rotate vectors between body and plane without trigonometric functions. These methods
+    accept positions with and without frames; the user's functions receive positions
+    without frames. On a manifold without frames the system and q are returned
+    unchanged.
     """
     # The methods of a subclass might not support frames.
     if type(system) not in (LagrangianSystem, HamiltonianSystem):

@@ -1,9 +1,9 @@
 """JAX's operations on arrays: shapes, indexing, gathers and scatters, reductions.
 
-Each operation takes the builder, the equation and the arrays of its operands, and
-returns arrays. Where the indices are known, numbers are moved while the graph is built,
-at no cost at run time. If an index is not known, the array is stored in memory, and the
-operation becomes loads and stores.
+Each operation takes the builder of the graph, the equation and the arrays of its
+operands, and returns arrays. Where the indices are known at compile time, numbers are
+moved while the graph is built, at no cost at run time. If an index is known only at run
+time, the array is stored in memory, and the operation becomes loads and stores.
 """
 
 import math
@@ -32,7 +32,7 @@ _Move = Callable[[np.ndarray], np.ndarray]
 
 
 def rearranged(builder: Builder, value: ArrayValue, move: _Move) -> ArrayValue:
-    """Rearrange the numbers of an array, in memory or not, as a NumPy function does."""
+    """Apply a function that rearranges NumPy arrays; the array may be in memory."""
     if not isinstance(value, InMemory):
         return move(value)
     memory = builder.memory
@@ -68,7 +68,7 @@ def _broadcast_in_dim(
     if not isinstance(value, InMemory) and value.size == 1:
         node = value.reshape(-1)[0]
         if node.op == "const" and node.attr == 0 and not np.signbit(float(node.attr)):
-            # JAX writes symbolic zero tangents in this way.
+            # JAX writes a symbolic zero tangent as a broadcast of the constant zero.
             node = builder.graph.zero(node.dtype)
         return builder.full(shape, node)
     if isinstance(value, InMemory) and math.prod(shape) == value.size:
@@ -178,8 +178,7 @@ def _pad(builder: Builder, equation: Any, values: list[ArrayValue]) -> ArrayValu
     ):
         low, _, interior = map(int, config)
         step = interior + 1
-        # Negative padding removes numbers; these are the first and last indices that
-        # stay.
+        # Negative padding removes numbers. The indices from `first` to `last` - 1 stay.
         first = max(0, -(low // step))
         last = min(length, (most - 1 - low) // step + 1)
         inner.append(slice(first, max(first, last)))
@@ -260,7 +259,7 @@ def _starts(
     sizes: Sequence[int],
     starts: list[ArrayValue],
 ) -> list[Node]:
-    """Clamp the starts of a window so that it lies in the array."""
+    """Clamp the starts of a window, so that the window lies in the array."""
     out = []
     for length, size, start in zip(shape, sizes, starts, strict=True):
         node = builder.memory.registers(start).reshape(-1)[0]
@@ -350,9 +349,9 @@ _Mode = jax.lax.GatherScatterMode
 class _Axes(NamedTuple):
     """The axes of an array on which a window starts at a variable index.
 
-    - `indexed`: the axes whose starts are the entries of an index.
-    - `batched`: the batch axes of the array. They belong to the axes `sources` of the
-      array of indices.
+    - `indexed`: the axes on which the start of the window is an entry of the index.
+    - `batched`: the batch axes of the array.
+    - `sources`: the axes of the array of indices that correspond to `batched`.
     """
 
     indexed: Sequence[int]
@@ -573,7 +572,10 @@ _REDUCTIONS = {
 
 
 def _rows(x: np.ndarray, axes: Sequence[int]) -> tuple[tuple[int, ...], np.ndarray]:
-    """Move the axes to the end, and flatten them to one."""
+    """Move `axes` to the end, flatten them to one, and flatten the other axes to one.
+
+    Returns the shape of the other axes, and the array with two axes.
+    """
     kept = [axis for axis in range(x.ndim) if axis not in axes]
     shape = tuple(x.shape[axis] for axis in kept)
     length = math.prod(x.shape[axis] for axis in axes)

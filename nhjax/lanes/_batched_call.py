@@ -1,9 +1,10 @@
 """The operation that stands for a program of many members, and its rules.
 
 `jax.vmap` of a compiled program is one operation, `batched_call`, with the program of
-one member. On the CPU the members are vectorised (SIMD) by this compiler. If that is
-not possible, they run one after the other in kernels, if the options allow it. On other
-devices, and if neither is possible, JAX batches the program.
+one member. On the CPU the members are vectorised (SIMD) by this compiler. If it cannot
+compile the program, and the options allow it, XLA compiles the program of one member to
+a single kernel, which runs for one member after the other. On other devices, and if
+neither is possible, JAX batches the program.
 """
 
 from functools import partial
@@ -77,7 +78,7 @@ batching.primitive_batchers[kernel] = _vmap_of_kernel
 
 
 def _vmap_of_batched_call(operands, axes, *, program, is_batched, options):
-    """Flatten two axes of members to one."""
+    """Flatten the new axis of members and the present axis of members to one axis."""
     pairs = list(zip(operands, axes, strict=True))
     size = next(x.shape[axis] for x, axis in pairs if axis is not None)
     member_shapes = [aval.shape for aval in program.in_avals]
@@ -111,7 +112,7 @@ batching.primitive_batchers[batched_call] = _vmap_of_batched_call
 
 
 def _jvp_of_batched_call(operands, tangents, *, program, is_batched, options):
-    """Compute values and tangents member by member, by the rule for one program."""
+    """Compute values and tangents member by member, by the rule for a single run."""
     is_moving = [not isinstance(tangent, ad.Zero) for tangent in tangents]
     rates, _ = partition_list(is_moving, tangents)
     zeros = [ad.Zero(aval.to_tangent_aval()) for aval in program.in_avals]

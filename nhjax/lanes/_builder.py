@@ -6,9 +6,9 @@ at run time.
 `Builder.run` interprets a jaxpr: for each equation it calls the operation that
 `_elementwise`, `_arrays` or `_control_flow` provides for the primitive.
 
-Loads and stores are statements in the order of the program. A store needs an array
-without other users: `hold` and `release` count the users, and an array with other users
-is copied first.
+Loads and stores are statements in the order of the program. A store overwrites an array
+only if the array has no other users: `hold` and `release` count the users, and an array
+with other users is copied first.
 """
 
 import math
@@ -61,7 +61,7 @@ ArrayValue: TypeAlias = Registers | InMemory
 
 
 def hold(value: ArrayValue) -> None:
-    """Keep an array in memory from being overwritten."""
+    """Protect an array in memory from being overwritten."""
     if isinstance(value, InMemory):
         value.buffer.holders += 1
 
@@ -72,11 +72,11 @@ def release(value: ArrayValue) -> None:
         value.buffer.holders -= 1
 
 
-# Larger arrays are kept in memory if both places are possible.
+# Arrays with more numbers than this are in memory, unless they must be in registers.
 MOST_IN_REGISTERS = 128
 # At most this many numbers are loaded, stored or computed one by one.
 MOST_ONE_BY_ONE = 4096
-# Longer copies become loops.
+# Copies of more numbers than this become loops.
 _LONGEST_UNROLLED = 16
 
 
@@ -125,7 +125,8 @@ class Memory:
     ) -> None:
         """Store an array at the indices in `view`, all shifted by `shift`.
 
-        The view is a slice of `flat_indices`, so that it is affine in its indices.
+        The view is a slice of `flat_indices`, so that its entries are affine functions
+        of their positions.
         """
         if isinstance(value, InMemory):
             self.move(buffer, view, value.buffer, flat_indices(value.shape), shift)
@@ -198,7 +199,7 @@ class Memory:
         return InMemory(buffer, shape)
 
     def registers(self, value: ArrayValue) -> Registers:
-        """Load an array, if it is in memory."""
+        """Return an array in registers; an array in memory is loaded."""
         if not isinstance(value, InMemory):
             return value
         _bound(value.size)
@@ -210,8 +211,8 @@ class Memory:
     def in_memory(self, value: ArrayValue) -> InMemory:
         """Put an array into memory that is not changed afterwards.
 
-        It is stored where its last number becomes known, outside of loops in which it
-        is read.
+        The array is stored in the region in which its last number becomes known. It is
+        not stored again in a loop that only reads it.
         """
         if isinstance(value, InMemory):
             return value
@@ -276,8 +277,8 @@ def _split(index: Node | None, offset: int) -> tuple[Node | None, int]:
 
 
 def _origin(flat: np.ndarray) -> Buffer | None:
-    """Return the unchanged memory from which these numbers were loaded, if there is
-    one.
+    """Return the memory that contains exactly these numbers and is no longer changed,
+    if the numbers were loaded from such memory.
     """
     first = flat[0]
     if first.op != "load" or first.args or not first.attr[0].is_fixed:
@@ -311,15 +312,16 @@ class Builder:
         self.graph = Graph()
         self.memory = Memory(self.graph)
         self.operations, self.unroll = operations, unroll
-        # The enclosing equations, which identify the current one.
+        # The enclosing equations, which identify the current equation.
         self.path: list[int] = []
-        # The numbers of each loop that are known to change, by the path of the loop.
+        # For the path of each loop, the positions of carried numbers that change.
         self.changing: dict[tuple[int, ...], set[int]] = {}
-        # For numbers that an earlier loop may have changed: the constants with which
-        # the numbers started.
+        # For the carried numbers of a loop that is continued: the constants with which
+        # the numbers started when the loop began.
         self.loop_starts: dict[Node, Node] = {}
         self.functions = Functions()
-        # Whether programs are written out here and not called as functions.
+        # Whether called programs are written out at present, and do not become
+        # functions.
         self.is_written_out = False
         self._last_uses: dict[int, tuple[Any, list[list[Any]]]] = {}
 
@@ -400,7 +402,7 @@ class Builder:
             now = {v for v in equation.invars if not isinstance(v, Literal)} - used
             used |= now
             lists.append(list(now))
-        # The jaxpr is kept, so that its identity is not reused.
+        # The jaxpr is stored too, so that no other object gets the same identity.
         self._last_uses[id(jaxpr)] = (jaxpr, lists[::-1])
         return lists[::-1]
 
@@ -432,13 +434,13 @@ class Builder:
         return self.array(values, dtype)
 
     def full(self, shape: tuple[int, ...], node: Node) -> Registers:
-        """Create an array with the same number everywhere, which takes no space."""
+        """Create an array with the same number everywhere, as a broadcast view."""
         out = np.empty((), object)
         out[()] = node
         return np.broadcast_to(out, shape)
 
     def index(self, value: ArrayValue) -> Node:
-        """Return a scalar as an index."""
+        """Convert a scalar to an index, which is a node of int64."""
         node = self.memory.registers(value).reshape(-1)[0]
         return self.graph.convert(node, "int64")
 
@@ -501,7 +503,7 @@ class Builder:
         return out.reshape(shape)
 
 
-# The primitives that run an inner program as it is. `eval_jaxpr` is the name of
+# The primitives that only run an inner program. `eval_jaxpr` is the name of
 # `closed_call` since JAX 0.12.
 CALLS = frozenset(
     """
@@ -519,13 +521,13 @@ def called_program(equation: Any) -> Any:
 
 
 def inner_programs(equation: Any) -> Iterator[tuple[Any, int]]:
-    """List the inner programs of an equation, and where their operands start.
+    """List the inner programs of an equation, with the index of their first operand.
 
-    The listed operands of a loop include its constants, which is harmless.
+    The operands of the body of a loop start with the constants of the body.
     """
     params, name = equation.params, equation.primitive.name
     if name == "while":
-        # The operands of the body, without the operands of the predicate.
+        # The operands of the body follow after the constants of the predicate.
         yield params["body_jaxpr"].jaxpr, params["cond_nconsts"]
     elif name == "cond":
         for branch in params["branches"]:

@@ -1,15 +1,16 @@
 """The cache of native code on disk, and the keys of its entries.
 
 The key of a program is a hash of all that its code depends on: the jaxpr with its
-constants, how it is compiled, the machine, and the versions of this compiler, of LLVM,
-of JAX and of NumPy. To compute it, the graph is not needed, so that it takes a small
-part of the time of compilation. A program gets no key if a parameter of an operation
-has a type that is not known here, such as a function of Python; it is then compiled in
+constants, the options of compilation, the machine, and the versions of this compiler,
+of LLVM, of JAX and of NumPy. The key is computed without the graph of the program. This
+takes much less time than compilation. If a parameter of an operation has a type that is
+not known here, such as a Python function, the program gets no key, and is compiled in
 each process.
 
 The cache follows JAX's options for its persistent compilation cache. It is a folder in
-JAX's directory, with one file for each program. A file contains its key and a checksum,
-and is written under another name first, so that other processes never see a part of it.
+JAX's directory, with one file for each program. A file contains the key, a checksum and
+the code. It is written under another name first, so that other processes never read an
+incomplete file.
 """
 
 import dataclasses
@@ -63,13 +64,14 @@ def directory() -> Path | None:
 
 
 def read(folder: Path, key: str) -> Entry | None:
-    """Return the entry of a key, or `None` if there is no file, or no intact one."""
+    """Return the entry of a key, or `None` if its file is missing or damaged."""
     path = folder / f"{key}{_SUFFIX}"
     try:
         data = path.read_bytes()
         entry = _unpacked(data, key)
         if entry is not None:
-            # The least recently used files are deleted first: mark this one as used.
+            # The least recently used files are deleted first, so mark this file as
+            # used.
             os.utime(path)
     except FileNotFoundError:
         return None
@@ -129,7 +131,7 @@ def _shrink(folder: Path, most: int) -> None:
         try:
             files.append((path.stat(), path))
         except FileNotFoundError:
-            # Another process has deleted it.
+            # Another process has deleted the file.
             continue
     total = sum(stat.st_size for stat, _ in files)
     for stat, path in sorted(files, key=lambda pair: pair[0].st_mtime_ns):
@@ -185,20 +187,20 @@ class _Unknown(Exception):
     """A value that cannot be compared by its contents."""
 
 
-# Parameters that describe the devices of arrays. No rule reads these parameters.
+# Parameters that describe the devices of arrays. The code does not depend on them.
 _DEVICES = ("sharding", "out_sharding")
 _PLAIN = frozenset((int, bool, str, bytes, type(None)))
 
 
 class _Encoder:
-    """Translates jaxprs to tuples of plain values, which are equal if the jaxprs are.
+    """Translates jaxprs to tuples of plain values, whose `repr` identifies the jaxpr.
 
-    `repr` of the results is unique. Inner programs are replaced by their hashes, since
-    they may occur several times.
+    The names of variables do not count. Inner programs are replaced by their hashes,
+    since an inner program may occur several times.
     """
 
     def __init__(self):
-        # The objects are kept too, so that their identities are not reused.
+        # The objects are stored too, so that no other objects get the same identities.
         self._jaxprs: dict[int, tuple[Any, str]] = {}
         self._avals: dict[int, tuple[Any, Any]] = {}
 
@@ -291,7 +293,7 @@ class _Encoder:
         if isinstance(value, enum.Enum):
             return name, value.name
         if isinstance(value, tuple):
-            # A named tuple.
+            # `value` is a named tuple.
             return name, list(map(self.value, value))
         if isinstance(value, Mapping):
             return name, self._items(value)
@@ -304,7 +306,7 @@ class _Encoder:
         try:
             array = np.asarray(value)
         except (TypeError, RuntimeError) as error:
-            # For example an array of random keys.
+            # `value` is, for example, an array of random keys.
             raise _Unknown from error
         if array.dtype.hasobject:
             raise _Unknown

@@ -1,7 +1,9 @@
 """Coefficients of polynomials, lowest power first.
 
-They interpolate at Chebyshev's nodes, and are computed and printed by
-`python tests/support/approximations.py`. `tests/lanes` checks their errors.
+A comment "f(x) in z" names the approximated function f and the variable z of the
+polynomial, which interpolates f at Chebyshev's nodes. `python
+tests/support/approximations.py` computes and prints the coefficients, and `tests/lanes`
+checks the errors of the polynomials.
 """
 
 # (sin(x) / x - 1) / x**2 in x**2, for |x| up to pi / 4.
@@ -68,7 +70,7 @@ LOG = (
     0.14616484198366603,
 )
 
-# (artanh(s) / s - 1 - s**2 / 3) / s**4 in s**2, for powers.
+# (artanh(s) / s - 1 - s**2 / 3) / s**4 in s**2, for the function `pow`.
 LOG_LONG = (
     0.2,
     0.14285714285714282,

@@ -1,12 +1,12 @@
 """Loops, branches, calls and products of a jaxpr: `while`, `cond`, `dot_general`, ….
 
 A loop carries arrays as parameters, number by number, or leaves them in place in
-memory. Numbers that start as constants are first assumed to stay constant. The body is
-built. If some of these numbers change, the body is built again without the assumption
-for them. The changing numbers are remembered: if an outer loop is built again, its
-inner loops need no second attempt, and the time does not multiply with the depth of
-nesting. If a loop continues an earlier one, the
-operation `loop_start` names the constants with which the earlier loop started.
+memory. First, numbers that start as constants are assumed to stay constant, and the
+body is built. If some of these numbers change, the body is built again without the
+assumption for them. The changing numbers are remembered: if an outer loop is built
+again, its inner loops need no second attempt. Otherwise the time to build nested loops
+would double with each level. If a loop continues an earlier loop, the operation
+`loop_start` names the constants with which the earlier loop started.
 
 Short scans are unrolled, unless their body contains loops. Products of arrays are
 written out number by number, or in a loop over the first index if they are long.
@@ -54,10 +54,10 @@ from ._jaxprs import COMPILED_ONCE, KEPT_CALL, WRITE_ROW
 # `jax.numpy.einsum`.
 _Indices: TypeAlias = tuple[str, str, str]
 
-# Longer sums of products of two arrays are computed in a loop. The loop takes less time
-# to compile, and is as fast for products of this length.
+# Sums of products of two arrays with more terms than this are computed in a loop. The
+# loop takes less time to compile than written-out terms, and runs as fast.
 _LONGEST_PRODUCT = 1000
-# Larger products are left to a library.
+# Sums of products with more terms than this are left to a library.
 _LARGEST_PRODUCT = 2**16
 
 
@@ -90,7 +90,7 @@ def _function_call(
 def _function(
     builder: Builder, equation: Any, values: list[ArrayValue]
 ) -> Function | None:
-    """Build the function of a program, unless its results are in memory."""
+    """Build the function of a program; return `None` if a result is in memory."""
     graph = builder.graph
     region = Region(None, None, is_side=False)
     arrays, parameters = parameters_for(graph, region, values)  # pyright: ignore
@@ -140,7 +140,10 @@ def _chosen(
     first: int,
     avals: list[Any],
 ) -> list[ArrayValue]:
-    """Run the branch of an index; larger indices select the last branch."""
+    """Run the branch that an index selects, among the branches from `first` on.
+
+    An index that is too large selects the last branch.
+    """
     if first == len(runs) - 1:
         return runs[first]()
     graph = builder.graph
@@ -178,7 +181,8 @@ def _branch(
         pair = (one, other)
         shared = _shared(one, other)
         if shared is None and _goes_to_memory(one, other):
-            # Neither side may change an array that the other side returns.
+            # The result gets its own memory, because neither side may change an array
+            # that the other side returns.
             target = memory.new(dtype_name(aval.dtype), one.size)
             shared = InMemory(target, aval.shape)
             for side, value in enumerate(pair):
@@ -368,7 +372,7 @@ def _unrolled(
         outs = builder.run(body.jaxpr, body.consts, [*consts, *carry, *row])
         builder.path.pop()
         carry, saved[index] = outs[:count], outs[count:]
-        # A row may lie in memory that the next iteration would overwrite.
+        # Without `hold`, the next iteration could overwrite a row that is in memory.
         for value in saved[index]:
             hold(value)
     stacked = []
@@ -523,7 +527,7 @@ def _dot_general(
 def _product(
     builder: Builder, values: list[ArrayValue], indices: _Indices, aval: Any
 ) -> ArrayValue:
-    """Compute a sum of products; if it is long, in a loop over the first index."""
+    """Compute sums of products; if long, in a loop over the result's first index."""
     first, second, result = indices
     dtype = dtype_name(aval.dtype)
     lengths = {
@@ -626,13 +630,13 @@ def loop(
     carried: list[ArrayValue] = []
     for value, is_there in zip(inits, in_memory, strict=True):
         carried.append(memory.owned(value) if is_there else memory.registers(value))
-        # A loop may carry the same array twice, and then needs two copies.
+        # A loop may carry the same array twice. Because of `hold`, it gets two copies.
         hold(carried[-1])
     for value in carried:
         release(value)
     buffers = [value.buffer for value in carried if isinstance(value, InMemory)]
     changing = builder.changing.setdefault(tuple(builder.path), set())
-    # Integer scalars are counters, which change.
+    # Integer scalars are usually counters, so they are assumed to change.
     for start, value in _starts(carried):
         if value.ndim == 0 and value[()].dtype.startswith("int"):
             changing.add(start)
@@ -675,8 +679,8 @@ class _Attempt:
         self.builder, self.carried = builder, carried
         self.loop = LoopBuilder(builder.graph)
         self.changing = changing
-        # `fixed` has, by position, the constants that are assumed not to change, and
-        # `varying` has the positions of the parameters.
+        # `fixed` maps positions to the constants that are assumed not to change.
+        # `varying` lists the positions of the numbers that are parameters of the loop.
         self.fixed: dict[int, Node] = {}
         self.varying: list[int] = []
         self.outs: list[Node] = []
@@ -739,7 +743,7 @@ class _Attempt:
         self.loop.end([self.outs[position] for position in self.varying])
 
     def wrong(self) -> list[int]:
-        """List the numbers that change although they were assumed constant."""
+        """List the positions of numbers that change but were assumed constant."""
         return [p for p, node in self.fixed.items() if self.outs[p] is not node]
 
     def results(self) -> list[ArrayValue]:
@@ -767,7 +771,8 @@ _SAME = ("reshape", "squeeze", "expand_dims", "copy", "copy_p", "optimization_ba
 def updated_inputs(jaxpr: Any) -> frozenset[int]:
     """List the inputs that a jaxpr, or an inner program of it, updates at an index.
 
-    Such arrays belong in memory. Updates at an index that is a literal do not count.
+    A loop carries these arrays in memory. Updates at an index that is a literal do not
+    count.
     """
     origins: dict[Any, int] = {v: i for i, v in enumerate(jaxpr.invars)}
     found: set[int] = set()

@@ -4,8 +4,8 @@ A kernel calls a function such as `@nhjax.exp.f64x8`, and `definitions` returns 
 of all functions that a kernel calls. Errors are below 2 ulp everywhere, and the values
 at infinities, zeros and NaN are the same as in C. All formulas are for float64; float32
 is converted to float64 and back, so that nearly all results are the nearest float32.
-Infinite and NaN arguments take no longer than others, so that a failed member does not
-slow down the other members of its vector.
+Infinite and NaN arguments take no longer than finite arguments, so that a failed member
+does not slow down the other members of its vector.
 """
 
 import math
@@ -107,8 +107,8 @@ def _call(op: str, results: int, *arguments: Value) -> tuple[Value, ...]:
 _LARGEST_QUOTIENT = 2.0**50
 _LONG_REMAINDER = "nhjax.long_remainder"
 
-# The remainder of |x| by |y| for finite x >= y > 0, by long division of the mantissas.
-# Each step shifts the remainder by up to 11 bits.
+# The remainder of the division of x by y for finite x >= y > 0, by long division of the
+# mantissas. Each step shifts the remainder by up to 11 bits.
 _LONG_REMAINDER_HEAD = (
     f"define internal double @{_LONG_REMAINDER}(double %x, double %y)"
 )
@@ -172,8 +172,8 @@ def rem(x: Value, y: Value) -> Value:
         rest = (a - high) - low
         rest = where(rest < 0.0, rest + b, rest)
     rest = where(a < b, a, rest)
-    # The exact product may overflow for very large numbers. It may underflow for very
-    # small numbers, if the processor replaces subnormal numbers by 0.
+    # `two_product` may overflow for very large numbers. It may underflow for very small
+    # numbers, if the processor replaces subnormal numbers by 0.
     is_long = (ratio > _LARGEST_QUOTIENT) | (a > 2.0**1000) | (b < 2.0**-900)
     is_long = is_long & (a < math.inf) & (b > 0.0) & (a >= b)
 

@@ -30,7 +30,7 @@ def _each(
 def _each_op(
     op: str, builder: Builder, equation: Any, values: list[ArrayValue]
 ) -> ArrayValue:
-    """Apply an operation of the graph directly; it does not need the equation."""
+    """Apply an operation of the graph that does not depend on the equation."""
     aval = equation.outvars[0].aval
     function = partial(builder.graph.op, op)
     return builder.map_numbers(aval.shape, dtype_name(aval.dtype), function, *values)

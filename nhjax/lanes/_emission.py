@@ -45,8 +45,8 @@ from ._writer import (
 _ALIGNMENT = 64
 _LARGEST_STACK = 2**16
 _LARGEST_SCRATCH = 2**26
-# A side of a divergent branch with more nodes than this is jumped over if no member
-# takes it. Shorter sides are always computed.
+# A side of a divergent branch that no member takes is jumped over, if the side has more
+# nodes than this. Shorter sides are always computed.
 _LONGEST_SIDE = 24
 _STATEMENTS = ("loop", "branch", "store", "load")
 _ALL = "splat (i1 true)"
@@ -86,7 +86,7 @@ def emit(
 
 
 def _members(width: int) -> list[str]:
-    """Write the indices of the members, at most the index of the last member."""
+    """Write the indices of the members, clamped to the index of the last member."""
     if width == 1:
         return ["  %members = add i64 %first, 0"]
     lines, whole, kind = [], "poison", vector("i64", width)
@@ -254,7 +254,7 @@ def _is_divergent(node: Node) -> bool:
 
 
 def _is_masked(inner: Region, outer: Region) -> bool:
-    """Return whether members that run in `outer` may be masked in `inner`."""
+    """Return whether members that are active in `outer` may be masked in `inner`."""
     region: Region | None = inner
     while region is not None and region is not outer:
         if region.owner is not None and region.owner.attr.predicate.is_divergent:
@@ -334,7 +334,8 @@ class _Functions:
     """The functions that a kernel calls, for vectors and for numbers."""
 
     def __init__(self, live: LiveNodes):
-        # The results that are used, with their places. The others are not computed.
+        # For each function, its results that are used, with their places in the struct
+        # that it returns. The other results are not computed.
         self._used: dict[Function, dict[int, int]] = {}
         self._names: dict[tuple[Function, int], str] = {}
         for node in live.nodes:
@@ -368,7 +369,8 @@ class _Functions:
         if width == 1 and len(floats) in (3, 4):
             # On x86-64 LLVM returns a third and a fourth float in registers of the x87
             # unit. Without optimisation, it does so with instructions that do not
-            # exist. Five floats are returned in memory, so add floats up to five.
+            # exist. Five floats are returned in memory, so unused floats are added to
+            # get five.
             dtypes += floats[: 5 - len(floats)]
         return result_type([vector(scalar_type(x), width) for x in dtypes])
 
@@ -420,9 +422,9 @@ def _called(node: Node) -> tuple[Function, list[Node]]:
 class _Regions:
     """The writer of regions, with the loops and branches in them.
 
-    `mask` marks the members that are running; `None` stands for all members. Regions
-    that no member enters are skipped at run time, except for short sides of divergent
-    branches.
+    `mask` is the name of the mask of the members that are running; `None` stands for
+    all members. Regions that no member enters are skipped at run time, except for short
+    sides of divergent branches.
     """
 
     def __init__(
@@ -504,7 +506,7 @@ class _Regions:
         for param, _, _ in params:
             _define(writer, param, param.name)
         if results is not None:
-            # Members that have left this loop do not run inner loops either.
+            # Members that have left this loop are masked in inner loops too.
             self.mask = active
         self.write(before)
         if results is not None:
@@ -539,10 +541,10 @@ class _Regions:
     def _leave(
         self, loop: LoopInfo, tag: str, active: str, results: "_LoopResults"
     ) -> None:
-        """Store the values of members that leave the loop; the others continue.
+        """Store the values of members that leave the loop; other members continue.
 
-        Members that have left keep computing, masked, until the last member leaves:
-        this is cheaper than stopping them.
+        Members that have left still compute, with their results masked, until the last
+        member leaves. Stopping them would be more expensive.
         """
         writer, flags = self.writer, vector("i1", self.writer.width)
         go_on = _operand(writer, loop.predicate, True)
@@ -563,7 +565,7 @@ class _Regions:
             self._one_side(branch)
 
     def _one_side(self, branch: BranchInfo) -> None:
-        """Write a branch that all members take to the same side: a jump."""
+        """Write a branch of which all members take the same side, as a jump."""
         writer, tag = self.writer, self._next_label()
         predicate = _operand(writer, branch.predicate, False)
         writer.add(f"br i1 {predicate}, label %{tag}.yes, label %{tag}.no")
@@ -592,7 +594,7 @@ class _Regions:
             _define(writer, result, result.name)
 
     def _both_sides(self, branch: BranchInfo) -> None:
-        """Write a divergent branch: both sides under masks, then a select."""
+        """Write a divergent branch: both sides with masks, then select instructions."""
         writer, flags = self.writer, vector("i1", self.writer.width)
         outer = self.mask
         predicate = _operand(writer, branch.predicate, True)
@@ -640,12 +642,12 @@ def _is_long(nodes: list[Node]) -> bool:
 
 
 class _LoopResults:
-    """The results of a loop that members leave one by one: they are kept in memory."""
+    """The results of a loop that members leave one by one, stored in memory."""
 
     def __init__(
         self, writer: Writer, memory: "_Memory", loop: LoopInfo, is_partial: bool
     ):
-        """Reserve the memory; `is_partial`: some members may skip the loop."""
+        """Reserve memory. `is_partial` says whether some members may skip the loop."""
         self.writer = writer
         self.slots: list[tuple[Node, Node, str]] = []
         for result in loop.results:
@@ -702,15 +704,16 @@ class _LoopResults:
 class _Memory:
     """The layout of a kernel's arrays in memory, and their loads and stores.
 
-    Divergent scratch memory holds, for each number, the values of all members side by
-    side, so that a load with a uniform index loads one vector. The members of a batched
-    operand, and of a result, are stored one after the other as JAX lays them out, so
-    that their loads and stores are gathers and scatters.
+    In divergent scratch memory the values of one number for all members are side by
+    side, so that a load with a uniform index loads one vector. In a batched operand and
+    in a result, all numbers of one member are followed by all numbers of the next
+    member, as in JAX's arrays. Their loads and stores are therefore gathers and
+    scatters.
     """
 
     def __init__(self, writer: Writer, buffers: list[Buffer]):
         self.writer, self.width = writer, writer.width
-        # The bytes of scratch memory.
+        # The size of scratch memory in bytes.
         self.size = 0
         self._bases: dict[Buffer, str] = {}
         self._members: dict[int, str] = {}
@@ -730,7 +733,7 @@ class _Memory:
         return self.writer.value(f"getelementptr i8, ptr %scratch, i64 {offset}")
 
     def _base(self, buffer: Buffer) -> str:
-        """Write the address that all accesses to a buffer start from."""
+        """Write the base address of a buffer, or of each member in a batched buffer."""
         writer, kind = self.writer, memory_type(buffer.dtype)
         if buffer.kind == "scratch":
             members = self.width if buffer.is_divergent else 1
@@ -742,7 +745,7 @@ class _Memory:
         start = writer.value(f"load ptr, ptr {place}")
         if buffer.kind == "operand" and not self._is_batched(buffer):
             return start
-        # The addresses of the first numbers of all members.
+        # This is a vector with the address of the first number of each member.
         index, members = vector("i64", self.width), self._starts(buffer.size)
         return writer.value(f"getelementptr {kind}, ptr {start}, {index} {members}")
 
@@ -778,7 +781,7 @@ class _Memory:
         if buffer.kind == "scratch" and buffer.is_divergent:
             if index is not None and index.is_divergent:
                 return self._member_address(buffer, index, offset), True
-            # The values of all members are one vector.
+            # At a uniform index, the values of all members are one vector.
             kind = vector(kind, self.width)
         is_vector = self.width > 1 and self._is_batched(buffer)
         if index is not None:
@@ -852,7 +855,7 @@ class _Memory:
         return f"{name}.v{self.width}p0", kind
 
     def store(self, node: Node, mask: str | None) -> None:
-        """Write a store, for the members of a mask if there is one."""
+        """Write a store; with a mask, only for the members in the mask."""
         buffer, offset = node.attr
         number, *rest = node.args
         index = rest[0] if rest else None

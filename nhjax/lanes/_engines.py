@@ -2,10 +2,10 @@
 
 XLA runs a program on the CPU as a sequence of kernels. Starting a kernel takes about 50
 ns, as long as the arithmetic of tens of numbers, and one iteration of a stage solver is
-about fifty such kernels. A called computation that is marked as small is compiled to a
-single kernel instead, including its loops. On the gallery's systems this is three to
-five times faster. The mark is internal to XLA, and its meaning may change. Without the
-mark, as on other devices, the results are the same.
+about fifty such kernels. If a called computation is marked as small, XLA compiles it to
+a single kernel, including its loops. On the gallery's systems this is three to five
+times faster than a sequence of kernels. The mark is internal to XLA, and its meaning
+may change. Without the mark, as on other devices, the results are the same.
 """
 
 import os
@@ -33,7 +33,8 @@ class EngineUse(NamedTuple):
     - `engine`: `"lanes"` is nhjax's own compiler, which vectorises over the members of
         an ensemble (SIMD); `"kernels"` is XLA with one kernel for each member; `"xla"`
         is XLA without such kernels.
-    - `reason`: why this engine was used, and why earlier engines were not used.
+    - `reason`: why this engine was used, and why the engines that are tried before it
+        were not used.
     - `members`: the number of members of an ensemble; `None` for a single run, and for
         a part of a program that is not compiled as a whole.
     """
@@ -69,17 +70,18 @@ def engines(function: Callable[..., Any], *args: Any) -> tuple[EngineUse, ...]:
     """Return which engines compile the programs of `function(*args)` on a CPU, and why.
 
     The programs are the runs of nhjax in the function, and the functions given to
-    `nhjax.lanes.vmap` and `nhjax.lanes.jit`. The function is compiled, but not run. On
+    `nhjax.lanes.vmap` and `nhjax.lanes.jit`. The function is lowered, but not run. On
     the CPU, nhjax compiles an ensemble (a run under `jax.vmap`) itself if possible, and
     vectorises over its members (SIMD). The environment variable `NHJAX_ENGINE` chooses
-    the engine: `lanes`, `kernels` or `xla`. If it is `lanes`, a program that `lanes`
-    cannot compile raises a `RuntimeError` with the reason. Programs that were compiled
-    before keep their engine until `jax.clear_caches()`.
+    the engine: `lanes`, `kernels` or `xla`. If its value is `lanes`, a program that
+    `lanes` cannot compile raises a `RuntimeError` with the reason. If the variable
+    changes, programs that are already compiled are not compiled again until
+    `jax.clear_caches()`.
 
     **Arguments:**
 
     - `function`: a function of arrays that can be compiled by `jax.jit`.
-    - `args`: its arguments, trees of arrays.
+    - `args`: the arguments of the function, trees of arrays.
 
     **Returns:** an `EngineUse` for each program, in the order of compilation: the
     engine, the reason, and the number of members.
@@ -101,7 +103,8 @@ def engines(function: Callable[..., Any], *args: Any) -> tuple[EngineUse, ...]:
     return tuple(uses)
 
 
-# Whether a kernel is being lowered. Kernels inside it do not become kernels themselves.
+# Whether a kernel is being lowered. A kernel inside another kernel is lowered as a part
+# of the outer kernel.
 _within = ContextVar("within", default=False)
 
 
@@ -110,13 +113,13 @@ def is_within_kernel() -> bool:
     return _within.get()
 
 
-# Whether XLA lowers the surrounding program. XLA then also lowers the operations
-# `batched_call` in this program.
+# Whether the surrounding program is left to XLA. The operations `batched_call` in this
+# program are then left to XLA too.
 _is_part = ContextVar("is_part", default=False)
 
 
 def is_part_of_a_program() -> bool:
-    """Return whether a part of a program is being lowered by XLA."""
+    """Return whether the current operation is part of a program that is left to XLA."""
     return _is_part.get()
 
 
@@ -139,7 +142,7 @@ def is_exported(ctx: Any) -> bool:
 
 
 def reason_against_lanes() -> str | None:
-    """Return why nhjax's own compiler is not tried, or `None` if it is."""
+    """Return why nhjax's own compiler is not tried, or `None` if it is tried."""
     if chosen_engine() not in ("lanes", None):
         return "chosen"
     if not is_available():
@@ -194,9 +197,9 @@ def by_one_kernel(ctx, *operands, program, options):
 def _tied(operands: tuple[Any, ...]) -> list[Any]:
     """Return the same operands, in a form that XLA cannot recognise as unused.
 
-    XLA aborts if a parameter of a marked call is unused, even if only its
-    simplifications remove the last use. For this reason every small operand is made to
-    depend on all others, in a way that never changes its value.
+    XLA aborts if a parameter of a marked call is unused, even if it is unused only
+    after XLA's own simplifications. For this reason every small operand is made to
+    depend on all operands, in a way that never changes its value.
     """
     firsts = [x.reshape(-1)[0] for x in operands]
     signs = [(x != jnp.zeros_like(x)).astype(jnp.int32) for x in firsts]

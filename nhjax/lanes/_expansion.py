@@ -1,9 +1,10 @@
 """Operations that are replaced by programs of simpler operations before compilation.
 
 Factorisations of small matrices are written out, since XLA calls a library for them.
-Under `vmap`, a loop can have a condition for each member. It gets a single condition.
-Operations of other libraries, such as equinox's operations for loops, are replaced by
-the program of their implementation, which they also run outside of transformations.
+Under `vmap`, a loop can have a condition for each member; it is replaced by a loop with
+a single condition. Operations of other libraries, such as equinox's operations for
+loops, are replaced by the program of their implementation. JAX runs this implementation
+if such an operation is called outside of transformations.
 """
 
 import math
@@ -18,18 +19,19 @@ import numpy as np
 from jax.extend.core.primitives import closed_call_p
 
 
-# Larger matrices are left to XLA, which calls LAPACK.
+# Matrices with more rows than this are left to XLA, which calls LAPACK.
 MOST_ROWS = 32
-# More matrices at once would make the written-out program long.
+# Stacks of more matrices than this are left to XLA too, because the written-out program
+# would be long.
 _MOST_MEMBERS = 16
-# Operations with this name have a method that JAX calls when it compiles them.
+# Operations with this name have a method `to_lojax`, by which JAX expands them.
 _EXPANDED_BY_JAX = "call_hi_primitive"
 
 
 def expanded(program: Any, known: Container[str]) -> Any:
     """Replace operations of a closed jaxpr, and of its inner programs, where possible.
 
-    The program is returned unchanged if it has no such operation.
+    The program is returned unchanged if no operation is replaced.
 
     **Arguments:**
 
@@ -47,7 +49,8 @@ class _Expander:
 
     def __init__(self, stays: Container[str]):
         self._stays = stays
-        # The original program is kept too, so that its identity is not reused.
+        # The original program is stored too, so that no other object gets the same
+        # identity.
         self._known: dict[int, tuple[Any, Any]] = {}
 
     def program(self, program: Any) -> Any:
@@ -79,7 +82,7 @@ class _Expander:
         return equation.replace(params=params)
 
     def _program_of(self, equation: Any) -> Any:
-        """Return a program that computes an operation by simpler ones, or `None`."""
+        """Return a program that replaces an operation, or `None` if there is none."""
         primitive, params = equation.primitive, equation.params
         if primitive.name in _EXPANSIONS:
             applies, function = _EXPANSIONS[primitive.name]
@@ -111,7 +114,8 @@ def _holds_programs(value: Any) -> bool:
 def is_foreign(primitive: Any) -> bool:
     """Return whether a library other than JAX has defined an operation.
 
-    JAX implements its own operations by compiling and running them.
+    The implementation of an operation of JAX is a function in a module of JAX, which
+    compiles and runs the operation.
     """
     implementation = primitive.impl
     while isinstance(implementation, partial):
@@ -221,14 +225,15 @@ def _eigh(a: Any, *, lower: bool, sort_eigenvalues: bool, **_: Any) -> tuple[Any
     del sort_eigenvalues
     size = len(a)
     a = jnp.tril(a) + jnp.tril(a, -1).T if lower else jnp.triu(a) + jnp.triu(a, 1).T
-    # A row of zeros makes the number of rows even. No rotation changes it.
+    # If the number of rows is odd, a row and a column of zeros are added. No rotation
+    # changes them.
     odd = size % 2
     a = jnp.pad(a, ((0, odd), (0, odd)))
     vectors = jnp.eye(len(a), dtype=a.dtype)
     off_diagonal = jnp.asarray(1 - np.eye(len(a)), a.dtype)
 
     def in_next_order(x: Any) -> Any:
-        """Move the rows so that other rows become neighbours, as in a tournament."""
+        """Move the rows to form other pairs, as in a round-robin tournament."""
         if len(x) == 2:
             return x
         tops, bottoms = x[0::2], x[1::2]
@@ -378,13 +383,13 @@ def _log2(x: Any, **_: Any) -> Any:
 
 
 def _one_minus_square(x: Any) -> Any:
-    """Compute 1 - x² by factors, accurate where x is close to one."""
+    """Compute 1 - x² as (1 + x) (1 - x), which is accurate for x close to one."""
     one = jnp.ones_like(x)
     return (one + x) * (one - x)
 
 
 def _polynomial(x: Any, *coefficients: Any, **_: Any) -> Any:
-    """Compute the polynomial whose coefficients are given from the constant term on."""
+    """Compute a polynomial; its coefficients begin with the constant term."""
     *others, value = coefficients
     for coefficient in reversed(others):
         value = value * x + coefficient
@@ -408,7 +413,7 @@ def _while_any(
     cond_nconsts: int,
     body_nconsts: int,
 ) -> list[Any]:
-    """Iterate while any member goes on; the others keep their values."""
+    """Iterate while any member goes on; the values of other members do not change."""
     test, body = map(jax.extend.core.jaxpr_as_fun, (cond_jaxpr, body_jaxpr))
     of_test, of_body = operands[:cond_nconsts], operands[cond_nconsts:][:body_nconsts]
 

@@ -3,7 +3,7 @@
 All formulas are for vectors of float64. With n the integer nearest to x / log(2),
 exp(x) is 2^n exp(r) with |r| <= log(2) / 2. With x = 2^k m and m from sqrt(1/2) to
 sqrt(2), log(x) is k log(2) + log(m), and log(m) is 2 artanh(s) with s = (m - 1) / (m +
-1). Polynomials approximate the remaining factors.
+1). Polynomials approximate exp(r) and artanh(s).
 """
 
 import math
@@ -83,7 +83,8 @@ def exp2(x: Value) -> Value:
 def _expm1_parts(x: Value) -> tuple[Value, DoubleDouble, Value]:
     """Return n, a double-double m with exp(x) - 1 = 2^n m, and 2^-n, for x >= -50."""
     exponent, (r, rest) = reduce_by_log2(x)
-    # 2^-n would be subnormal for the largest x, where it does not matter.
+    # For the largest x, 2^-n would be subnormal. It is replaced by 0 for x > 100, where
+    # it does not change the result.
     unit = where(x > 100.0, 0.0, power_of_two(-exponent))
     high, low = fast_two_sum(1.0 - unit, r)
     tail = low + (r * r * polynomial(r, EXP) + rest)
@@ -166,7 +167,7 @@ def exponent_and_mantissa(x: Value) -> tuple[Value, Value]:
 
 
 def _log_of(k: Value, f: Value, correction: Value | float) -> Value:
-    """Return k log(2) + log(1 + f) + correction, where 1 + f is m."""
+    """Return k log(2) + log(1 + f) + correction, with sqrt(1/2) < 1 + f < sqrt(2)."""
     s = f / (2.0 + f)
     z, half = s * s, 0.5 * f * f
     small = s * (half + z * polynomial(z, LOG)) + (k * LN2_LOW + correction)
@@ -189,7 +190,7 @@ def _log1p(x: Value, low: Value | float = 0.0, doublings: Value | float = 0.0) -
         rest = rest + low
     k, m = exponent_and_mantissa(high)
     is_near = k.equals(0.0)
-    # 1 + x loses the last digits of a small x.
+    # 1 + x loses the last digits of a small x, so x itself is used where k = 0.
     f = where(is_near, x, m - 1.0)
     lost = where(is_near, low, rest) / high
     return _log_of(k + doublings, f, lost)
@@ -203,7 +204,10 @@ def log1p(x: Value) -> Value:
 
 
 def asinh(x: Value) -> Value:
-    """Return the inverse hyperbolic sine, log(1 + (x + sqrt(1 + x^2) - 1)), x > 0."""
+    """Return the inverse hyperbolic sine of x.
+
+    For x > 0 it is log(1 + (x + sqrt(1 + x^2) - 1)).
+    """
     size = absolute(x)
     is_large = size > 2.0**100
     square, error = two_product(size, size)
@@ -278,7 +282,7 @@ def _long_log(x: Value) -> DoubleDouble:
 
 
 def _is_integer(x: Value) -> Value:
-    """Return for which members x >= 0 is an integer; infinity counts as one."""
+    """Return for which members x >= 0 is an integer; infinity counts as an integer."""
     with x.writer.exact():
         return (((x + 2.0**52) - 2.0**52).equals(x)) | (x >= 2.0**52)
 
@@ -287,7 +291,7 @@ def pow(x: Value, y: Value) -> Value:
     """Return x to the power of y: exp(y log|x|), with the sign of x^y."""
     size = absolute(x)
     high, low = _long_log(size)
-    # The cases 0, infinity and NaN.
+    # Set the logarithms of 0, infinity and NaN, for which `_long_log` is not valid.
     is_finite, is_zero = size < math.inf, size.equals(0.0)
     high = where(is_zero, -math.inf, where(is_finite, high, size))
     low = where(is_finite & (size > 0.0), low, 0.0)

@@ -1,12 +1,12 @@
 """The structures of XLA's foreign function interface, and its errors, in LLVM IR.
 
-The structures come from the header `xla/ffi/api/c_api.h` in `jax.ffi.include_dir()`, as
-LLVM types, which have the layout of the platform's C compiler. The listed fields keep
-their offsets: within a major version of the interface, structures only grow at the end,
-and each structure contains its size, so that code compiled with an older header keeps
-working. Names may change: the names here are the names of version 0.3, and version 0.5
-has the same fields at the same offsets. A test compares the structures with the
-installed header.
+The structures come from the header `xla/ffi/api/c_api.h` in `jax.ffi.include_dir()`.
+They are written as LLVM types, which have the layout of the platform's C compiler.
+Within a major version of the interface, structures only grow at the end, so that the
+offsets of the listed fields do not change. Each structure contains its size, so that
+code compiled with an older header still works. Names may change: the names here are the
+names of version 0.3, and version 0.5 has the same fields at the same offsets. A test
+compares the structures with the installed header.
 """
 
 # The lowest version of the interface that has all fields that the handler uses. A
@@ -20,7 +20,7 @@ INVALID_ARGUMENT, RESOURCE_EXHAUSTED = 3, 8
 _HEAD = {"struct_size": "i64", "extension_start": "ptr"}
 _LIST = {"size": "i64", "types": "ptr"}
 
-# The fields of each structure in order, up to the last one that is used.
+# The fields of each structure in order, up to the last field that is used.
 STRUCTS: dict[str, dict[str, str]] = {
     "XLA_FFI_Extension_Base": {"struct_size": "i64", "type": "i32", "next": "ptr"},
     "XLA_FFI_Api_Version": {**_HEAD, "major_version": "i32", "minor_version": "i32"},
@@ -103,7 +103,7 @@ def field(pointer: str, struct: str, *path: str) -> str:
     **Arguments:**
 
     - `pointer`: the address of the structure.
-    - `struct`: its name.
+    - `struct`: the name of the structure.
     - `path`: the name of the field. If the field is a structure, the name of a field in
         this structure follows.
     """
@@ -115,7 +115,7 @@ def field(pointer: str, struct: str, *path: str) -> str:
     return f"getelementptr inbounds %{struct}, ptr {pointer}, {', '.join(indices)}"
 
 
-# The names of the messages, which are constants of the module.
+# The names of the constant strings in the module that contain the error messages.
 NO_MEMORY, MISMATCH = "nhjax.no_memory", "nhjax.mismatch"
 NO_SCRATCH = "nhjax.no_scratch"
 

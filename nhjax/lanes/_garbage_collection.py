@@ -8,8 +8,8 @@ from contextlib import contextmanager
 
 # A large program consists of millions of objects, nearly all of which live as long as
 # the program. By default Python looks for cycles each time that 700 objects have been
-# created. This took a third of the time to trace a bicycle's gradient, and found almost
-# no garbage.
+# created. These searches took a third of the time to trace the gradient of a bicycle,
+# and found almost no garbage.
 _OBJECTS = 100_000
 
 _lock = threading.Lock()
@@ -19,11 +19,12 @@ _outside: tuple[int, int, int] = gc.get_threshold()
 
 @contextmanager
 def rare_collections() -> Iterator[None]:
-    """Make Python look for cyclic garbage less often inside the block.
+    """Make Python look for cyclic garbage less often inside a `with` block.
 
-    The thresholds apply to the whole process: the first thread that enters such a block
-    sets them, and the last thread that leaves restores them. If the collector is
-    switched off, or already runs less often, the block has no effect.
+    The thresholds of the collector apply to the whole process: the first thread that
+    enters such a block sets them, and the last thread that leaves such a block restores
+    them. If the collector is switched off, or already runs less often, the block has no
+    effect.
     """
     global _inside, _outside
     with _lock:

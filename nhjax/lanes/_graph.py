@@ -2,17 +2,17 @@
 
 A node is one number or one statement: a store, a loop or a branch. Every node lies in a
 region: the root, the body of a loop, or a side of a branch. Within a region nodes are
-ordered by their numbers, which is the order of creation, so that a node comes after its
-arguments, and a load comes after the stores that it must see.
+ordered by their numbers, that is, in the order of creation. A node therefore comes
+after its arguments, and a load comes after the stores that it must see.
 
-Pure nodes are hash-consed: an operation with the same arguments exists once. A pure
-node lies in the deepest region of its arguments, so that invariant code is hoisted out
-of loops. It never leaves the side of a branch in which it was created, because the
-program may take the other side.
+Nodes without side effects are pure. They are hash-consed: an operation with the same
+arguments exists once. A pure node lies in the deepest region of its arguments, so that
+invariant code is hoisted out of loops. It never leaves the side of a branch in which it
+was created, because the program may take the other side.
 
 `Graph.op` folds constants and removes operations, but never changes a result: rounding,
-infinities, NaN and -0.0 are unchanged. Only a structural zero makes a product zero for
-every value of the other factor.
+infinities, NaN and -0.0 are unchanged. The exception is a structural zero, such as a
+zero from padding: its product with any number is zero, also with infinity and NaN.
 
 The order of this file: the data (regions, nodes, memory), `Graph`, the rules of
 simplification, the builders of loops and branches, and functions: programs that are
@@ -239,7 +239,7 @@ class Graph:
     def statement(
         self, op: str, args: tuple[Node, ...], dtype: str = "", attr: Any = None
     ) -> Node:
-        """Create a node that is not moved: a statement, or a statement's result."""
+        """Create a node that is not hoisted: a statement, or a statement's result."""
         return Node(op, args, dtype, self.region, self.next_number(), attr)
 
     def op(self, op: str, *args: Node, dtype: str | None = None) -> Node:
@@ -355,7 +355,7 @@ def _round_away(a: Any) -> Any:
     return whole + np.copysign(np.where(np.abs(a - whole) >= 0.5, 1, 0), a)
 
 
-# The functions that fold constants. Their results equal the compiled program's.
+# The functions that fold constants. They return the same results as compiled code.
 _FOLDS: dict[str, Callable[..., Any]] = {
     "add": np.add,
     "sub": np.subtract,
@@ -388,8 +388,8 @@ _FOLDS: dict[str, Callable[..., Any]] = {
 _Rule = Callable[..., Node | None]
 
 
-# The kinds of nodes whose value is known, and the kinds that the rules below look for
-# in the arguments of arithmetic. Most nodes are of other kinds.
+# The kinds of nodes whose value is known, and the kinds of arguments that the rules for
+# sums and products can simplify. Most nodes are of other kinds.
 _KNOWN = frozenset(("const", "zero"))
 _SPECIAL = frozenset((*_KNOWN, "neg"))
 
@@ -628,7 +628,8 @@ class LoopBuilder:
         for index, (param, init, after) in enumerate(
             zip(info.params, info.inits, info.outs, strict=True)
         ):
-            # A parameter that the body returns unchanged keeps its first value.
+            # A parameter that the body returns unchanged has its first value at the
+            # end too.
             if after is param:
                 out.append(init)
             else:
@@ -669,7 +670,7 @@ class BranchBuilder:
             self.graph.region = self.node.region
 
     def close(self, yes: list[Node], no: list[Node]) -> list[Node]:
-        """Select between numbers of the two sides."""
+        """End the branch; return its results, which are numbers of the side taken."""
         graph, info = self.graph, self.info
         info.outs = (yes, no)
         self.node.number = graph.next_number()
@@ -682,10 +683,11 @@ class BranchBuilder:
 
 # Functions
 
-# A run calls each function of a system, and its derivatives, at ten or more places:
-# without functions, LLVM would compile a copy at each of them. A program becomes a
-# function if it is long and pure arithmetic on numbers. Operands that are constants are
-# part of the function, so that zeros and ones are simplified as in a copy.
+# A run uses each function of a system, and its derivatives, at ten or more places. If
+# kernels could not call functions, LLVM would compile a copy at each of these places. A
+# program becomes a function if it is long and consists only of arithmetic. Operands
+# that are constants are part of the function, so that zeros and ones are simplified as
+# in a copy.
 #
 # A copy shares its common subexpressions with its surroundings, and its invariant
 # operations are hoisted out of loops. Therefore programs are still written out in
@@ -697,12 +699,13 @@ class BranchBuilder:
 # pure, so that calls with equal arguments are merged, and calls without users are
 # removed.
 
-# Shorter programs are written out: a function would save too little compile time.
+# Programs with fewer nodes than this are written out, because a function would save too
+# little compile time.
 _SHORTEST = 500
 # A function with constants is replaced by a more general function if the constants save
 # less than this fraction of the nodes.
 _LEAST_GAIN = 0.1
-# A function needs neither memory nor jumps.
+# A function contains none of these nodes, which access memory, jump or call.
 _STATEMENTS = frozenset(
     ("load", "store", "loop", "branch", "param", "result", "call", "part")
 )
@@ -714,8 +717,8 @@ _Pattern: TypeAlias = tuple[Node | None, ...]
 class Function:
     """A program in a region of its own.
 
-    - `parameters`: the numbers that it is called with.
-    - `outs`: its results.
+    - `parameters`: the nodes that stand for the arguments of a call.
+    - `outs`: the results.
     - `nodes`: the nodes that compute the results, in order.
     - `general`: `None`, or the more general function that is called instead, with its
         arguments: constants, and indices of arguments of this function.
@@ -785,7 +788,10 @@ class Functions:
 
 
 def _unify(one: Function, own: _Pattern, general: Function, wider: _Pattern) -> None:
-    """Let `one` call `general`, if that has fewer constants and is hardly longer."""
+    """Let `one` call `general`, if this is worthwhile.
+
+    `general` must have fewer constants, and must be hardly longer.
+    """
     pairs = list(zip(own, wider, strict=True))
     is_wider = all(b is None or a is b for a, b in pairs)
     is_short = len(one.nodes) >= (1 - _LEAST_GAIN) * len(general.nodes)
@@ -797,7 +803,7 @@ def _unify(one: Function, own: _Pattern, general: Function, wider: _Pattern) -> 
 
 
 def needed(outs: Sequence[Node]) -> list[Node]:
-    """Return the nodes that some nodes depend on, without constants, in order."""
+    """List `outs` and all nodes that they depend on, in order, without constants."""
     found, waiting = set(), list(outs)
     while waiting:
         node = waiting.pop()

@@ -9,20 +9,21 @@ A call is divided into blocks: the members that the kernel computes at once form
 block. The caller's thread runs blocks. Threads of XLA's pool help if this saves time:
 
 - An atomic counter assigns blocks to the caller and to its helpers.
-- The caller asks the pool for helpers. Their number is smaller than the number of
-    threads of the pool, because the caller works too. The number is so small that each
-    helper works for longer than waking it takes.
-- At the end the caller waits for the blocks that helpers have begun. It does not wait
-    for helpers that have not started: they may never start, because the pool has no
-    free thread, or because this process was forked and has no pool any more. A call
-    therefore always ends, since a thread needs no other thread to finish its block.
-- The data that helpers share with the caller, the job, is kept until the last helper
-    has seen that no block is left, which may be long after the call.
+- The caller asks the pool for helpers. The number of helpers is smaller than the number
+    of threads of the pool, because the caller works too. It is also so small that each
+    helper works for longer than it takes to wake the helper.
+- When no block is left, the caller waits for the blocks that helpers have begun. It
+    does not wait for helpers that have not started: they may never start, because the
+    pool has no free thread, or because this process was forked and has no pool any
+    more. A call therefore always ends, because every block that was begun has a thread
+    of its own, which needs no other thread.
+- The data that helpers share with the caller are called the job. The job is freed when
+    the last helper has seen that no block is left, which may be long after the call.
 
 Several devices of one process share the pool, and so do several threads of Python. For
 this reason all programs of the process share a counter of the threads that are working
-in blocks. If their number equals the number of threads of the pool, a call starts no
-helper; if it is larger, helpers leave after a block.
+in blocks. If the counter equals the number of threads of the pool, a call starts no
+helper. If the counter is larger, helpers leave after a block.
 """
 
 import time
@@ -46,9 +47,9 @@ from ._ffi import (
 
 # The shortest work, in ns, for which a helper is woken. Waking it takes about 10 µs.
 _WORTH_A_HELPER = 50_000
-# The number of times that the caller yields its core before it sleeps. The first
-# sleeps take 50 µs. Later sleeps take an eighth of the time slept so far, so that the
-# caller is late by at most an eighth.
+# The number of times that a waiting caller yields its core before it sleeps, and the
+# limits of a sleep in µs. Between these limits, a sleep takes an eighth of the time
+# slept so far, so that the caller wakes late by at most an eighth of this time.
 _YIELDS, _SHORTEST_SLEEP, _LONGEST_SLEEP = 100, 50, 10_000
 
 # The description of a program: its kernel, the numbers of its operands and results, the
@@ -66,7 +67,8 @@ PROGRAM = {
 # The data that the threads of a call share: the numbers of blocks begun and done, the
 # number of threads that hold the job, the number of threads of the pool, the number of
 # blocks, the last member, whether a block failed, the addresses of the data, and the
-# program. The first two change often, and each has its own cache line.
+# program. The numbers of blocks begun and done change often, so that each of these two
+# has its own cache line.
 JOB = {
     "begun": "i64",
     "padding_1": "[7 x i64]",
@@ -342,9 +344,9 @@ POOL = "\n".join([_POOL_DECLARATIONS, _RUN, _WORK, _WANTED, _ASK, _WAITING])
 # The names of a program's handler, and of the function that all handlers call.
 HANDLER, SHARED_HANDLER = "nhjax.handler", "nhjax.handle"
 
-# The time, in ns, that a block is assumed to take until one has been run: so long that
-# all available helpers are started. Longer times are replaced by this one, so that
-# products do not overflow.
+# The time, in ns, that a block is assumed to take before any block has been run. It is
+# so long that all available helpers are started. Longer measured times are replaced by
+# this time, so that products do not overflow.
 _LONG = 1 << 30
 
 
@@ -359,9 +361,10 @@ def handler_ir(
 
     - `num_operands`, `num_results`: the numbers of arrays that the kernel reads and
         writes.
-    - `width`: the number of members that it computes at once.
+    - `width`: the number of members that the kernel computes at once.
     - `is_batched`: whether the leading axis of the results is the axis of the members.
-        Otherwise there is one member. A program without results has no members.
+        Otherwise there is one member. For a program without results, the handler
+        computes no member.
     """
     values = {
         "kernel": "@kernel",

@@ -148,7 +148,7 @@ def _extremum(writer: Writer, node: Node, width: int, args: list[str]) -> str:
         return _intrinsic(writer, sign + node.op, dtype, width, args)
     for index, arg in enumerate(node.args):
         if arg.is_constant and arg.attr != 0 and not np.isnan(arg.attr):
-            # Then signed zeros and NaN need no special case.
+            # With such a constant, signed zeros and NaN need no special case.
             known, other = args[index], args[1 - index]
             order = "ogt" if is_max else "olt"
             wins = writer.value(f"fcmp {order} {kind} {known}, {other}")

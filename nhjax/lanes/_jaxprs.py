@@ -22,8 +22,8 @@ import numpy as np
 # kernel. Calls into libraries (products of matrices, factorisations, transforms),
 # sorting, scattering and callbacks are not in the lists.
 #
-# These operations act element by element, and `nhjax._numerics._sparsity` relies on
-# this: do not list other operations here.
+# The operations in `ELEMENTWISE` act element by element. `nhjax._numerics._sparsity`
+# relies on this property, so do not list other operations here.
 ELEMENTWISE = """
     abs acos acosh add add_any and asin asinh atan atan2 atanh
     bitcast_convert_type cbrt ceil clamp convert_element_type cos cosh div eq erf
@@ -39,8 +39,8 @@ _SHAPING = """
     concatenate copy copy_p expand_dims pad rev slice split squeeze stack
     transpose unstack
 """.split()  # noqa: SIM905
-# The arrays of these operations may be large, such as the rows that are saved, because
-# only a part of an array is moved.
+# The arrays of these operations may be large, such as the array of all saved rows,
+# because only a part of the array is moved.
 _MOVING = """
     broadcast_in_dim dynamic_slice dynamic_update_slice empty empty2 iota
     loop_start reshape write_row
@@ -52,7 +52,7 @@ SMALL_PRODUCT = "small_product"
 # nhjax's own operation, which writes a row of an array.
 WRITE_ROW = "write_row"
 # nhjax's own operation, which calls a program. The program and its derivatives are
-# traced once and kept.
+# traced once, and then reused.
 KEPT_CALL = "kept_call"
 # Functions under `jax.jit` whose names have this prefix are compiled once, and called
 # by kernels.
@@ -117,11 +117,12 @@ def _programs(params: Any) -> Iterator[Any]:
 def rms_array_size(program: Any, per_loop: int = 1) -> float:
     """Return the root mean square of the sizes of arrays in arithmetic.
 
-    An operation inside a loop counts `per_loop` times as much as an operation around
-    the loop.
+    An operation inside a loop counts `per_loop` times as much as an operation outside
+    of the loop.
 
-    In a program with loops, large arrays outside of them do not count: they are often
-    the rows of all steps, and the steps take far longer than an operation on the rows.
+    In a program with loops, large arrays outside of the loops do not count: such arrays
+    are often the rows of all steps, and the steps take far longer than an operation on
+    the rows.
     """
     found = list(_arithmetic_sizes(program, 0))
     has_loop = any(depth for _, depth in found)
@@ -137,7 +138,7 @@ def rms_array_size(program: Any, per_loop: int = 1) -> float:
 
 
 def _arithmetic_sizes(program: Any, depth: int) -> Iterator[tuple[int, int]]:
-    """List the sizes of arrays in arithmetic, and how many loops contain it."""
+    """List, for each arithmetic operation, the size of its array and its loop depth."""
     for equation in program.eqns:
         name = equation.primitive.name
         if name in _ARITHMETIC:
@@ -167,8 +168,8 @@ def num_results(program: Any) -> int:
     return count
 
 
-# Only these operations are removed when repeated. They have no state (random numbers
-# have one), and no parameters that a user chooses.
+# Only the operations in this set are removed when they are repeated. They have no
+# state, which random numbers have, and no parameters that a user chooses.
 _REPEATABLE = frozenset(
     (*ARITHMETIC_AND_SHAPES, "dot_general", "gather", KEPT_CALL, SMALL_PRODUCT)
 )
@@ -204,7 +205,8 @@ class _Simplifier:
     """
 
     def __init__(self):
-        # The original program is kept too, so that its identity is not reused.
+        # The original program is stored too, so that no other object gets the same
+        # identity.
         self._known: dict[int, tuple[Any, Any]] = {}
 
     def __call__(self, program: Any) -> Any:
@@ -247,7 +249,7 @@ class _Simplifier:
 
 
 def _used(jaxpr: Any) -> list[Any]:
-    """List the operations whose results are used, or that have effects."""
+    """List the operations that have effects, or results that are used."""
     used, found = set(variables(jaxpr.outvars)), []
     for equation in reversed(jaxpr.eqns):
         if equation.effects or not used.isdisjoint(equation.outvars):
@@ -262,7 +264,7 @@ def variables(operands: Any) -> list[Any]:
 
 
 def _is_repeatable(equation: Any) -> bool:
-    # Another operation cannot use a result without a name.
+    # A result that is dropped has no name, so that no other operation can use it.
     return equation.primitive.name in _REPEATABLE and not any(
         isinstance(variable, jax.extend.core.DropVar) for variable in equation.outvars
     )

@@ -1,9 +1,9 @@
 """The operation that stands for a program compiled as a whole, and its derivatives.
 
-`run_program` binds a program as one operation, `cpu_kernel`. Its forward derivative is
-a pair of such operations, one for the values and one that is linear in the tangents;
-reverse mode transposes the second. `_program` decides how a program is compiled: this
-depends on the device and on the operations of the program.
+`run_program` binds a program as one operation, `cpu_kernel`. The forward derivative of
+this operation is a pair of such operations: one computes the values, and the other is
+linear in the tangents. Reverse mode transposes the linear operation. `_program` decides
+how a program is compiled, depending on the device and on the operations of the program.
 """
 
 from collections.abc import Iterable
@@ -27,13 +27,13 @@ ENGINES = ("lanes", "kernels", "xla")
 class CompileOptions(NamedTuple):
     """How a program is compiled.
 
-    - `is_brief`: whether the program runs once and for a short time. It is then
-        compiled in less time, to slower code.
-    - `engines`: the engines that may compile it, and its derivatives, in the order in
-        which they are tried.
+    - `is_brief`: whether the program runs once and for a short time. Such a program
+        is compiled in less time, to slower code.
+    - `engines`: the engines that may compile the program and its derivatives, in the
+        order in which they are tried.
     - `xla_below`: a program with fewer operations than this is compiled by XLA if XLA
-        compiles the program around it. Calls of native code from a loop of XLA take
-        longer than few operations.
+        compiles the program around it, because a call of native code from a program of
+        XLA takes longer than a few operations.
     - `note`: text that the function `engines` adds to the reason.
     """
 
@@ -49,8 +49,8 @@ def run_program(program: Any, leaves: list[Any], options: CompileOptions) -> lis
     **Arguments:**
 
     - `program`: a closed jaxpr.
-    - `leaves`: its operands.
-    - `options`: how it is compiled.
+    - `leaves`: the operands of the program.
+    - `options`: how the program is compiled.
     """
     program = cse_dce(program)
     # A primitive must receive all traced values as operands, and must have no effects,
@@ -68,9 +68,9 @@ def captures_tracers(program: Any) -> bool:
 def never_high(*_: Any, **__: Any) -> bool:
     """Tell JAX not to expand operations inside a program before it is lowered.
 
-    Since JAX 0.12, some operations ("high" primitives) are expanded to simpler ones. A
-    primitive whose program contains such operations would need a rule that expands them
-    (`to_lojax`). Here they are expanded when the program is lowered.
+    Since JAX 0.12, some operations ("high" primitives) are expanded to simpler
+    operations. A primitive whose program contains high primitives would need a rule
+    that expands them (`to_lojax`). Here they are expanded when the program is lowered.
     """
     return False
 
@@ -100,8 +100,8 @@ def _shapes(*operands, program, options):
 def kernel_jvp(operands, tangents, *, program, options):
     """Compute values and tangents in two kernels, the second linear in the tangents.
 
-    There are two kernels so that reverse mode can store the results of the first and
-    transpose the second.
+    There are two kernels so that reverse mode can store the results of the first kernel
+    and transpose the second kernel.
     """
     options = options._replace(is_brief=False)
     run = jax.extend.core.jaxpr_as_fun(program)
@@ -131,8 +131,8 @@ def kernel_jvp(operands, tangents, *, program, options):
         all_rates = [ad.instantiate_zeros(tangent) for tangent in tangents]
         return jax.jvp(run, operands, all_rates)
     size = len(program.out_avals)
-    # Residuals that depend on no operand are recomputed and not stored: in a loop they
-    # would be stored in each iteration.
+    # Residuals that depend on no operand are recomputed and not stored: in a loop, they
+    # would be stored again in each iteration.
     fixed, is_varying = _fixed_part(whole)
     is_kept = [True] * size + is_varying[size:]
     kept, fixed_results = partition_list(is_kept, whole.jaxpr.outvars)
@@ -168,8 +168,8 @@ def _fixed_part(program) -> tuple[list[Any], list[bool]]:
 def split_by_operands(program) -> tuple[list[Any], Any]:
     """Compute the operations that depend on no operand; return a program for the rest.
 
-    Returns the computed values that this program uses, and the program. The values are
-    its first operands.
+    Returns the computed values that the program for the rest uses, and this program,
+    whose first operands are these values.
     """
     jaxpr = program.jaxpr
     fixed, others, varying = _split(jaxpr.invars, jaxpr.eqns)
@@ -186,7 +186,7 @@ def split_by_operands(program) -> tuple[list[Any], Any]:
 def _split(
     operands: list[Any], equations: list[Any]
 ) -> tuple[list[Any], list[Any], set[Any]]:
-    """Split operations into those that depend on no operand, and the others.
+    """Split operations into operations that depend on no operand, and all others.
 
     Operations with effects count as dependent. The third result is the set of the
     operands and of all variables that depend on them.
@@ -204,8 +204,8 @@ def _split(
 def part_of(program, consts: list[Any] | None = None, **fields: Any):
     """Return a program with some of its fields replaced.
 
-    `fields` are new values for fields of its jaxpr: `eqns`, `invars`, `constvars` or
-    `outvars`.
+    `fields` are new values for fields of the jaxpr, such as `eqns`, `invars`,
+    `constvars` or `outvars`.
     """
     names = program.jaxpr.debug_info.with_unknown_names()
     jaxpr = program.jaxpr.replace(debug_info=names, **fields)

@@ -5,8 +5,8 @@ can be imported without llvmlite.
 
 The code is position-independent, has the small code model, and is linked by JITLink, so
 that the constants of a kernel are reached by short addresses. The large code model,
-llvmlite's default for a JIT, first loads the address of each constant: with it, kernels
-were a tenth to a third slower, and took longer to compile.
+llvmlite's default for a JIT, first loads the address of each constant. Kernels with the
+large code model were a tenth to a third slower, and took longer to compile.
 """
 
 import platform
@@ -30,9 +30,9 @@ class Target(NamedTuple):
 # the handler calls.
 _PLATFORMS = {("linux", "x86_64"), ("linux", "aarch64"), ("darwin", "arm64")}
 
-# The level of LLVM's passes on the IR. Kernels are simplified when they are created:
-# code of level 1 was as fast as code of level 3, and took half of the time to compile.
-# Without passes the code was 5 to 15 percent slower.
+# The level of LLVM's passes on the IR. Kernels are already simplified when they are
+# written. Therefore code of level 1 was as fast as code of level 3, and took half of
+# the time to compile. Without passes the code was 5 to 15 percent slower.
 _PASSES = 1
 # A module is short if its text has fewer characters than `_LONG_TEXT`. Short and long
 # modules have different levels of the code generator. Level 1 takes half of the compile
@@ -40,7 +40,8 @@ _PASSES = 1
 # was 2 percent faster.
 _LONG_TEXT = 1_000_000
 _GENERATION_OF_SHORT, _GENERATION_OF_LONG = 2, 1
-# The level of both for programs that must compile quickly: no optimisation.
+# The level of the passes and of the code generator for programs that must compile
+# quickly: no optimisation.
 _QUICK = 0
 
 
@@ -50,7 +51,7 @@ def is_available() -> bool:
     if (sys.platform, platform.machine()) not in _PLATFORMS:
         return False
     if sys.maxsize < 2**32:
-        # A 32-bit Python.
+        # This is a 32-bit Python.
         return False
     try:
         _llvm()
@@ -107,7 +108,7 @@ def object_code(
     **Arguments:**
 
     - `texts`: the modules, in LLVM IR. They may declare the same functions.
-    - `exported`: the only function that is visible from outside.
+    - `exported`: the only function that is visible outside of the object file.
     - `target`: the machine, which may differ from the machine of this process.
     - `is_quick`: whether to compile in a third of the time or less, to slower code.
     """
@@ -137,14 +138,15 @@ def load(code: bytes, name: str, symbol: str, imports: dict[str, int]) -> int:
     for imported, address in imports.items():
         builder.import_symbol(imported, address)
     library = builder.export_symbol(symbol).link(_linker(), name)
-    # Otherwise the code would be unmapped when this object is freed.
+    # Without `detach`, the code would be unmapped when `library` is freed.
     library.detach()
     return library[symbol]
 
 
 @lru_cache(maxsize=1)
 def _linker() -> Any:
-    # llvmlite does not free this when Python exits, so that it lives as long as XLA.
+    # llvmlite does not free this linker when Python exits. The code therefore stays
+    # valid as long as XLA may call it.
     return _llvm().create_lljit_compiler(
         _machine(host(), _GENERATION_OF_SHORT), use_jit_link=True
     )
@@ -173,10 +175,11 @@ def _compiled(
     is_long = sum(map(len, texts)) >= _LONG_TEXT
     level = _GENERATION_OF_LONG if is_long else _GENERATION_OF_SHORT
     machine = _machine(target, _QUICK if is_quick else level)
-    # The types and constants of modules in the global context are never freed.
+    # A new context is used, because types and constants in the global context are never
+    # freed.
     context = llvm.create_context()
     module, *others = [llvm.parse_assembly(text, context) for text in texts]
-    # Without these, the passes would use a generic layout instead of this machine's.
+    # Without the triple and the layout, the passes would assume a generic machine.
     for part in (module, *others):
         part.triple = machine.triple
         part.data_layout = str(machine.target_data)
@@ -193,7 +196,7 @@ def _compiled(
     options = llvm.create_pipeline_tuning_options(
         speed_level=_QUICK if is_quick else _PASSES
     )
-    # The members are vectors already.
+    # Loops are not vectorised, because vectors already contain the members.
     options.loop_vectorization = options.loop_interleaving = False
     options.slp_vectorization = options.loop_unrolling = False
     builder = llvm.create_pass_builder(machine, options)

@@ -1,6 +1,6 @@
 """The parts of a program that call Python, and the part that can be compiled.
 
-A compiled operation cannot call Python, as `jax.debug.print` and the error checks of
+A compiled operation cannot call Python, but `jax.debug.print` and the error checks of
 other libraries do. `parts` divides the operations of a program, and `evaluate` computes
 the operations outside of the compiled part one by one, as JAX would without
 compilation.
@@ -31,10 +31,11 @@ class Parts(NamedTuple):
 def parts(equations: list[Any]) -> Parts:
     """Divide a program so that no operation of the part `inside` calls Python.
 
-    Calls of Python that need no loop and at most a quarter of the operations, such as
-    checks of the operands, are computed before this part. Other calls of Python, and
-    the operations that depend on them, are computed after it. Operations that are
-    needed by two parts are computed twice.
+    If the operands of a call of Python depend on no loop and on at most a quarter of
+    the operations, the call is computed before this part. Checks of the operands of the
+    program are examples. Other calls of Python, and the operations that depend on them,
+    are computed after the part `inside`. Operations that two parts need are computed
+    twice.
     """
     total = sum(map(_count, equations))
     maker = {x: index for index, e in enumerate(equations) for x in e.outvars}
@@ -48,7 +49,7 @@ def parts(equations: list[Any]) -> Parts:
             needed = _needed(index, equations, maker)
             size = sum(_count(equations[i]) for i in needed)
             has_loop = any(_has_loop(equations[i]) for i in needed)
-            # Effects stay in order.
+            # The order of effects does not change.
             is_late |= has_loop or 4 * size > total
             is_late |= has_effects and bool(equation.effects)
             has_effects |= is_late and bool(equation.effects)
@@ -67,7 +68,7 @@ def parts(equations: list[Any]) -> Parts:
 
 
 def _needed(index: int, equations: list[Any], maker: dict[Any, int]) -> set[int]:
-    """Return the indices of the operations that an operation depends on."""
+    """Return the indices of all operations that an operation depends on."""
     found: set[int] = set()
     waiting = [index]
     while waiting:
@@ -83,8 +84,8 @@ def _across_members(equations: list[Any], is_late: list[bool]) -> list[bool]:
 
     Operations of other libraries may combine members under `jax.vmap`: an error check
     computes whether any member has failed. If the part after the compiled part needs
-    the results of such operations, JAX computes the operations again, unless they
-    contain loops.
+    results that depend on such operations, JAX computes these operations again, unless
+    they contain loops.
     """
     wanted: set[Any] = set()
     serves = []
@@ -103,7 +104,7 @@ def _across_members(equations: list[Any], is_late: list[bool]) -> list[bool]:
 
 
 def inlined(program: Any, *leaves: Any) -> list[Any]:
-    """Compute a program; calls of functions that call Python are inlined."""
+    """Compute a program; functions under `jax.jit` that call Python are inlined."""
     values = start(program, leaves)
     for equation in program.jaxpr.eqns:
         if equation.primitive.name in ("jit", "pjit") and python_calls(equation):
@@ -116,7 +117,7 @@ def inlined(program: Any, *leaves: Any) -> list[Any]:
 
 
 def start(program: Any, leaves: Iterable[Any]) -> dict[Any, Any]:
-    """Return the values of the constants and operands of a closed jaxpr."""
+    """Map the variables of a closed jaxpr's constants and operands to their values."""
     names = [*program.jaxpr.constvars, *program.jaxpr.invars]
     return dict(zip(names, [*program.consts, *leaves], strict=True))
 
@@ -145,7 +146,7 @@ def _count(equation: Any) -> int:
 
 
 def python_calls(equation: Any) -> set[str]:
-    """Return the names of callbacks and of operations with effects in an equation."""
+    """Name the operations in an equation that are callbacks or have effects."""
     name = equation.primitive.name
     if name in _CALLBACKS:
         return {name}

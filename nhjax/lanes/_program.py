@@ -1,18 +1,18 @@
 """Compilation of a jaxpr to native code that XLA calls by a name, and lowering rules.
 
 `compile_batched` and `compile_single` build the graph of a program (`build_graph`),
-write its kernel (`llvm_ir`), compile it together with a handler, and register the
-handler with XLA under a name (`register_kernel`).
+write its kernel (`llvm_ir`), compile the kernel together with a handler, and register
+the handler with XLA under a name (`register_kernel`).
 
 The name is a hash of the kernel, the machine, the version of the compiler and the level
 of optimisation, so that equal programs have equal names in all processes and are
-compiled once in a process. XLA keeps names as long as the process runs, and an
-executable may call them at any time. Code is therefore never freed: a program takes 20
-to 150 KB, and `compiled_code` returns the total.
+compiled once in a process. A name stays registered with XLA as long as the process
+runs, and an executable may call the handler at any time. Code is therefore never freed:
+a program takes 20 to 150 KB, and `compiled_code` returns the total.
 
 Before the graph is built, the key of the jaxpr is looked up (`_cache`): in this
-process, and then in the cache on disk if JAX's options switch it on. The entry has the
-name and the native code, so that a known program needs neither the graph nor LLVM.
+process, and then in the cache on disk if JAX's options switch it on. An entry on disk
+contains the name and the native code, so that neither the graph nor LLVM is needed.
 
 The rules at the end of the file lower the operations that stand for a program
 (`_kernel`, `_batched_call`) to calls of native code, or leave the program to another
@@ -76,9 +76,9 @@ from ._native import host, host_width, load, object_code, version
 
 
 def compile_single(program: Any, is_brief: bool = False) -> str:
-    """Compile a program for a single run, and return its name for calls.
+    """Compile a program for a single run, and return its name for `jax.ffi.ffi_call`.
 
-    With `is_brief` it is compiled in less time, to slower code.
+    With `is_brief` the program is compiled in less time, to slower code.
 
     **Raises:** `Unsupported` if the program cannot be compiled.
     """
@@ -93,8 +93,9 @@ def compile_batched(
     **Arguments:**
 
     - `program`: a closed jaxpr, the program of one member.
-    - `is_batched`: for each operand, whether every member has its own, along the
-        leading axis. All results have this axis.
+    - `is_batched`: for each operand, whether its leading axis is the axis of the
+        members. Otherwise all members share it. The leading axis of all results is the
+        axis of the members.
     - `is_brief`: whether to compile in less time, to slower code.
 
     **Returns:** a name for `jax.ffi.ffi_call` and `jax.ffi.ffi_lowering`.
@@ -152,16 +153,18 @@ def llvm_ir(
     **Arguments:**
 
     - `program`: the closed jaxpr of one member.
-    - `is_batched`: for each operand, whether it has the member as its leading axis.
+    - `is_batched`: for each operand, whether its leading axis is the axis of the
+        members.
     - `width`: the number of members in a vector, a power of two.
-    - `contract`: whether a product and a sum may be rounded together.
+    - `contract`: whether a product and a sum may be fused, so that they are rounded
+        once.
 
     **Returns:**
 
     The text of an LLVM module with the function `i1 kernel(ptr operands, ptr results,
-    i64 first, i64 last)`. It computes the members from `first` to `first + width - 1`;
-    members beyond `last` repeat `last`. It returns true if it failed, which happens
-    only if it cannot allocate scratch memory.
+    i64 first, i64 last)`. The function computes the members from `first` to `first +
+    width - 1`; instead of members beyond `last`, it computes `last` again. It returns
+    true if it failed, which happens only if it cannot allocate scratch memory.
 
     **Raises:** `Unsupported` if the program cannot be compiled.
     """
@@ -172,10 +175,10 @@ def llvm_ir(
 
 # Scans of at most this length are unrolled.
 LONGEST_UNROLLED_SCAN = 8
-# Programs with more nodes than this are refused, unless they have fewer than 40 nodes
-# for each of JAX's operations. LLVM takes about 10 s for this number of nodes, and
-# minutes for more. XLA keeps loops over arrays: it takes a few seconds for large
-# arrays, but longer than LLVM for many small arrays.
+# Programs with more nodes than `MOST_NODES` are refused, unless they have on average at
+# most `NODES_PER_OPERATION` nodes for each operation of JAX. LLVM takes about 10 s for
+# this number of nodes, and minutes for more. XLA does not unroll operations on arrays:
+# it takes a few seconds for large arrays, but longer than LLVM for many small arrays.
 MOST_NODES, NODES_PER_OPERATION = 100_000, 40
 
 OPERATIONS: dict[str, Operation] = {
@@ -230,7 +233,8 @@ def _count_operations(jaxpr: Any) -> int:
     count = len(jaxpr.eqns)
     for equation in jaxpr.eqns:
         if equation.primitive.name == "small_product":
-            # A small product stands for two broadcasts, a product and a sum.
+            # A small product counts as four operations: two broadcasts, a product and a
+            # sum.
             count += 3
         for part in jax.tree.leaves(equation.params):
             part = getattr(part, "jaxpr", part)
@@ -241,8 +245,8 @@ def _count_operations(jaxpr: Any) -> int:
 # The size in bytes of the code of each program, by its name.
 _programs: dict[str, int] = {}
 
-# The names of programs by the keys of their jaxprs. Different jaxprs may have the same
-# name.
+# The names of programs by the keys of their jaxprs. Two different jaxprs may have the
+# same kernel, and then have the same name.
 _names: dict[str, str] = {}
 
 # The number of threads that are working in kernels. All programs share this counter.
@@ -254,7 +258,7 @@ _lock = threading.RLock()
 
 
 def _after_fork() -> None:
-    # The threads that were working belong to the parent.
+    # The counted threads run in the parent process, not in this child process.
     _workers.value = 0
     _lock.release()
 
@@ -294,10 +298,11 @@ def register_kernel(
     - `kernel_ir`: a module in LLVM IR with `define i1 @kernel(ptr %operands, ptr
         %results, i64 %first, i64 %last)`, which computes `width` members from `%first`
         on, but no members after `%last`. `%operands` and `%results` are arrays of the
-        addresses of the data. Several threads may run it at the same time, on different
-        members.
-    - `num_operands`, `num_results`: the numbers of arrays that it reads and writes.
-    - `width`: the number of members that it computes at once.
+        addresses of the data. Several threads may run the kernel at the same time, on
+        different members.
+    - `num_operands`, `num_results`: the numbers of arrays that the kernel reads and
+        writes.
+    - `width`: the number of members that the kernel computes at once.
     - `is_batched`: whether the leading axis of the results is the axis of the members.
         Otherwise the kernel is called once, for member 0.
     - `is_brief`: whether to compile in less time, to slower code.
@@ -317,7 +322,10 @@ def _registered(
     is_batched: bool,
     quick: bool,
 ) -> Entry:
-    """Compile and register a kernel; the result has no code if this has been done."""
+    """Compile and register a kernel, unless this has been done.
+
+    The result has no code if the kernel was already registered.
+    """
     handler = handler_ir(num_operands, num_results, width, is_batched)
     name = _name(kernel_ir, handler, "quick" if quick else "optimised")
     with _lock:
@@ -347,8 +355,8 @@ def _register(name: str, code: bytes) -> None:
 def _shared_handler() -> int:
     """Return the address of the function that the handlers of all programs call.
 
-    Apart from the kernels that it runs, it takes less than a microsecond, so that
-    optimising it would cost more than it gains.
+    Apart from the kernels that it runs, this function takes less than a microsecond.
+    Optimising it would therefore take longer than the time that it saves.
     """
     code = object_code([shared_handler_ir()], SHARED_HANDLER, host(), is_quick=True)
     imports = {WORKERS: ctypes.addressof(_workers)}
@@ -372,15 +380,16 @@ def _name(*texts: str) -> str:
 
 
 # This compiler turns all arrays into scalars. Measurements on the gallery's systems
-# with 2 to 8 stages, and on larger systems, show that its code is faster if the root
-# mean square of array sizes is at most `_SMALL_ARRAYS`. For larger arrays XLA is often
-# faster, since it uses vectors for loops over arrays also in a single run. But XLA
-# takes more than 1 ms to compile an operation. Therefore XLA compiles only short
-# programs between the two sizes, and all programs above `_LARGE_ARRAYS`.
+# with 2 to 8 stages, and on larger systems, show that its code is faster than XLA's if
+# the root mean square of array sizes is at most `_SMALL_ARRAYS`. For larger arrays XLA
+# is often faster, since it uses vectors for operations on arrays also in a single run.
+# But XLA takes more than 1 ms to compile an operation. Therefore, between the two sizes
+# XLA compiles only short programs. Above `_LARGE_ARRAYS` it compiles all programs.
 _SMALL_ARRAYS, _LARGE_ARRAYS = 40, 110
 _SHORT_PROGRAM = 2800
-# A program can have its large arrays in operations that are made once a step, and small
-# arrays in the iteration of the step. The code of this compiler is faster then.
+# A program can have large arrays in operations that are computed once in each step, and
+# small arrays in the iterations of each step. For such a program, the code of this
+# compiler is faster than XLA's.
 _PER_LOOP, _SMALL_IN_LOOPS = 16, 32
 
 
@@ -400,7 +409,10 @@ _NOT_LANES = (
 
 
 class _Ways(NamedTuple):
-    """The ways to lower an operation: named native code, XLA, and kernels of XLA."""
+    """The ways to lower an operation: native code, XLA, and single kernels of XLA.
+
+    `compiled` compiles the program to native code, and returns its name.
+    """
 
     compiled: Callable[[], str]
     by_xla: Callable[..., Any]
@@ -452,7 +464,7 @@ def _by_first_engine(
 ):
     """Lower a program by the first engine that can compile it, and record the engine.
 
-    `reason` is the reason not to try native code, or `None` if it is tried.
+    `reason` is the reason not to try native code, or `None` if native code is tried.
     """
     options = params["options"]
     if is_exported(ctx):
@@ -482,7 +494,8 @@ def _reason_against_kernel(
 ) -> str | None:
     """Return why XLA does not compile a single kernel, or `None` if it does.
 
-    `reason` is the reason against `lanes`, which comes first.
+    `reason` is the reason against `lanes`. The returned text begins with it, if both
+    reasons differ.
     """
     if "kernels" not in options.engines:
         return reason

@@ -1,11 +1,12 @@
 """`vmap` and `jit` for functions of the user, compiled as whole programs.
 
 The function is traced to a program, which becomes one operation (`_kernel`). Under
-`jax.vmap` this operation becomes one operation for all members (`_batched_call`), and
-it has rules for derivatives. `_program` lowers it to native code, or leaves it to XLA.
+`jax.vmap` this operation becomes one operation for all members (`_batched_call`). Both
+operations have rules for derivatives. `_program` lowers them to native code, or leaves
+them to XLA.
 
 Calls of Python, such as `jax.debug.print` or the error checks of other libraries,
-cannot be part of such an operation. JAX computes these calls before and after the
+cannot be part of such an operation. JAX computes these calls before or after the
 operation (`_parts`).
 """
 
@@ -31,10 +32,11 @@ from ._kernel import (
 from ._parts import evaluate, inlined, parts, python_calls, read, start
 
 
-# Kernels compute one member after the other, which for large arrays takes longer than
-# JAX's own `vmap`.
+# The engine `kernels` is left out: its kernels compute one member after the other,
+# which for large arrays takes longer than JAX's own `vmap`.
 _OPTIONS = CompileOptions(engines=("lanes", "xla"))
-# Constants with more numbers are operands, so that native code does not contain them.
+# Constants with more numbers than this become operands, so that native code does not
+# contain them.
 _LARGEST_CONSTANT = 256
 _ARRAYS = (jax.Array, np.ndarray, np.generic)
 _NUMBERS = (bool, int, float, complex)
@@ -51,9 +53,9 @@ def vmap(
     """Vectorise a function like `jax.vmap`, over SIMD lanes and threads where possible.
 
     On the CPU the function is compiled to native code that computes 2 to 8 members at
-    once (up to 16 in float32), with loops and branches that each member leaves when it
-    has finished. This is meant for functions of small arrays, such as ODE solvers,
-    filters and controllers.
+    once (up to 16 in float32). A loop in this code ends when the members that are
+    computed at once have finished, and not when the whole batch has finished. Use this
+    `vmap` for functions of small arrays, such as ODE solvers, filters and controllers.
     If the function cannot be compiled, `jax.vmap` computes the result, and
     `nhjax.engines` returns the reason.
 
@@ -105,15 +107,15 @@ def vmap(
         axes["spmd_axis_name"] = spmd_axis_name
         if None not in jax.tree.leaves(out_axes, is_leaf=_is_none):
             return jax.vmap(member, in_axes, out_axes, **axes)(*args, **kwargs)
-        # All members share the results with `None` in `out_axes`. Otherwise JAX raises
-        # an error in `eval_shape`. The compiled operation returns all results for each
-        # member, so that shared results are taken from the first member.
+        # All members must share the results with `None` in `out_axes`; otherwise JAX
+        # raises an error in `eval_shape`. The compiled operation returns all results
+        # for each member, so that shared results are taken from the first member.
         theirs = partial(jax.vmap(plain, in_axes, out_axes, **axes), *args, **kwargs)
         jax.eval_shape(theirs)
         all_axes = jax.tree.map(_first_if_none, out_axes, is_leaf=_is_none)
         out = jax.vmap(member, in_axes, all_axes, **axes)(*args, **kwargs)
         if any(0 in x.shape for x in jax.tree.leaves(out)):
-            # There may be no first member.
+            # If there are no members, there is no first member.
             return theirs()
         return jax.tree.map(_shared, out_axes, out, is_leaf=_is_none)
 
@@ -124,10 +126,10 @@ def jit(fun: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function like `jax.jit`, to native code without XLA where possible.
 
     XLA runs a program on the CPU as a sequence of kernels, and starting a kernel takes
-    as long as the arithmetic of tens of numbers. Functions with loops over small arrays
-    are therefore several times faster as native code. If the function cannot be
-    compiled, or has larger arrays, XLA compiles it, and `nhjax.engines` returns the
-    reason.
+    as long as arithmetic with tens of numbers. Functions with loops that compute with
+    small arrays are therefore several times faster as native code than under `jax.jit`.
+    If the function cannot be compiled to native code, or has larger arrays, XLA
+    compiles it, and `nhjax.engines` returns the reason.
 
     **Arguments:**
 
@@ -228,7 +230,8 @@ def _check_hashable(fun: Callable[..., Any], tree: Any) -> None:
 def _name(fun: Callable[..., Any], path: tuple[Any, ...]) -> str:
     """Return the name of an argument in the signature of a function.
 
-    The path leads through a pair of positional and keyword arguments.
+    `path` is the path to the argument in a pair: the positional arguments, and the
+    keyword arguments.
     """
     is_keyword, place = path[0].idx, path[1]
     if is_keyword:
@@ -287,12 +290,13 @@ def _run(program: Any, leaves: list[Any]) -> list[Any]:
     before, inside, after = parts(program.jaxpr.eqns)
     values = start(program, leaves)
     evaluate(before, values)
-    # Results of the first part that the compiled part needs, and does not compute.
+    # The results of the part `before` that the compiled part needs, but does not
+    # compute itself.
     known = [x for equation in before for x in equation.outvars]
     needed = {x for equation in inside for x in variables(equation.invars)}
     made = {x for equation in inside for x in equation.outvars}
     given = [x for x in known if x in needed - made]
-    # Results of the compiled part that the last part or the caller needs.
+    # The results of the compiled part that the part `after` or the caller needs.
     made -= {x for equation in after for x in equation.outvars}
     used = variables(program.jaxpr.outvars)
     used += [x for equation in after for x in variables(equation.invars)]

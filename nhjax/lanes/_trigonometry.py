@@ -7,8 +7,8 @@ argument.
 
 Large arguments are reduced by the method of Payne and Hanek. The number x = m 2^e, with
 an integer m of 53 bits, is multiplied by 2 / pi. The binary digits of 2 / pi that add
-multiples of 4 to the product are left out, and the next 192 digits are used. This is
-enough for the float64 nearest to a multiple of pi / 2.
+multiples of 4 to the product are left out, and the next 192 digits are used. With 192
+digits, r is accurate even for the float64 that is nearest to a multiple of pi / 2.
 """
 
 import math
@@ -134,7 +134,7 @@ def _reduce(x: Value) -> tuple[Value, DoubleDouble]:
         high = difference - small
         low = (difference - high) - small
     size = absolute(x)
-    # For infinity and NaN, the results are NaN already.
+    # For infinite x and NaN, the formulas above already give NaN.
     is_large = (size > _LARGEST_DIRECT) & (size < math.inf)
 
     def otherwise() -> tuple[Value, ...]:
@@ -233,9 +233,10 @@ def atan(x: Value) -> Value:
 
 
 def atan2(y: Value, x: Value) -> Value:
-    """Return the angle from the first axis of the point (x, y)."""
+    """Return the angle between the first axis and the direction to the point (x, y)."""
     a, b = absolute(y), absolute(x)
-    # For two infinities the angle is as for equal numbers; for two zeros it is 0 or pi.
+    # If both a and b are infinite, they are replaced by 1. If both are 0, b is replaced
+    # by 1, so that the angle is 0 or pi.
     are_infinite = a.equals(math.inf) & b.equals(math.inf)
     a, b = where(are_infinite, 1.0, a), where(are_infinite, 1.0, b)
     scale = where((a > 2.0**1000) | (b > 2.0**1000), 0.25, 1.0)

@@ -2,11 +2,12 @@
 
 Kernels and elementary functions are written by one class, `Writer`, which collects the
 instructions of one function. Its method `value` appends an instruction that is given as
-text and returns the name of the result; the code that writes kernels works on this
-level, since it writes 10^4 instructions and more.
+text and returns the name of the result. The code that writes kernels uses this method
+directly, which takes less time: a kernel has 10^4 instructions or more.
 
-Formulas are written with `Value`, a name with its type. Its operators append
-instructions, so that the Python expression `(x - n * a) * b` writes its instructions.
+Formulas are written with `Value`, the name of a result and its type. The operators of
+`Value` append instructions, so that the Python expression `(x - n * a) * b` writes the
+instructions that compute it.
 The functions below `Value` are the common arithmetic of the elementary functions:
 polynomials, and double-double numbers.
 """
@@ -88,8 +89,8 @@ class Writer:
     """The instructions of one function, and the definitions that they refer to.
 
     - `width`: the number of members, which is the length of the vectors.
-    - `contract`: the fast-math flag that allows a product and a sum to be fused, with a
-        space after it, or empty.
+    - `contract`: the text of the fast-math flag that allows a product and a sum to be
+        fused, with a space at the end, or an empty text.
     - `block`: the label of the basic block that is being written.
     - `constants`, `declarations`: text that stands outside of the function.
     - `wanted`: the elementary functions that are called, as (primitive, dtype, width).
@@ -228,9 +229,10 @@ class Writer:
         usual: tuple["Value", ...],
         rare: Callable[[], tuple["Value", ...]],
     ) -> tuple["Value", ...]:
-        """Return the results of `rare()` for members of `is_rare`, otherwise `usual`.
+        """Return `rare()` for the members where `is_rare` is true, otherwise `usual`.
 
-        The instructions of `rare` are skipped at run time if there is no such member.
+        If `is_rare` is false for all members, the instructions of `rare` are skipped at
+        run time.
         """
         is_any = self.any_of(is_rare.name)
         self.count += 1
@@ -249,7 +251,7 @@ class Writer:
         )
 
     def result(self, *values: "Value") -> None:
-        """Return one value or several from the function."""
+        """Append the instruction that returns one value or several values."""
         result, whole = result_type([self.type(x.kind) for x in values]), values[0].name
         if len(values) > 1:
             whole = "poison"
@@ -265,8 +267,8 @@ class Writer:
 class Value:
     """A vector, or a scalar where the width is 1, to be used in formulas.
 
-    - `kind`: the LLVM type of its elements, such as `double` or `i64`.
-    - `name`: the name of the instruction that computed it, or a constant.
+    - `kind`: the LLVM type of the elements, such as `double` or `i64`.
+    - `name`: the name of the instruction that computed the vector, or a constant.
     """
 
     def __init__(self, writer: Writer, kind: str, name: str):
@@ -422,7 +424,7 @@ def _intrinsic(name: str, *arguments: Value) -> Value:
 # round-off of the first number.
 DoubleDouble: TypeAlias = tuple[Value, Value]
 
-# Adding this number rounds to an integer, which is then in the lowest bits.
+# Adding this number to x rounds x to an integer, stored in the lowest bits of the sum.
 _TO_INTEGER = 1.5 * 2.0**52
 # The bits of 1.0.
 ONE_BITS = 0x3FF0000000000000
@@ -433,8 +435,8 @@ _HALF_UNIT = 1 << 26
 def polynomial(x: Value, coefficients: Sequence[float]) -> Value:
     """Evaluate a polynomial with the given coefficients, lowest power first.
 
-    As in Estrin's scheme, the even and the odd powers are evaluated separately, each in
-    the same way: the chain of dependent products is shorter than in Horner's scheme.
+    As in Estrin's scheme, the even and the odd powers are evaluated separately, by
+    recursion. The chain of dependent products is shorter than in Horner's scheme.
     """
     powers = [x]
     while 2 ** len(powers) < len(coefficients):
@@ -454,8 +456,8 @@ def polynomial(x: Value, coefficients: Sequence[float]) -> Value:
 def nearest(x: Value) -> tuple[Value, Value]:
     """Return the integer nearest to x, as a float and in the lowest bits of an integer.
 
-    This holds for |x| < 2^51. The lowest 51 bits of the second result are the integer
-    modulo 2^51.
+    The results are valid for |x| < 2^51. The lowest 51 bits of the second result are
+    the integer modulo 2^51.
     """
     with x.writer.exact():
         shifted = x + _TO_INTEGER
@@ -463,10 +465,10 @@ def nearest(x: Value) -> tuple[Value, Value]:
 
 
 def times_power_of_two(x: Value, exponent: Value) -> Value:
-    """Return x 2^n, rounded once, where n is in the lowest 13 bits.
+    """Return x 2^n, rounded once, where n is in the lowest 13 bits of `exponent`.
 
-    It needs |n| <= 2000. Half of the power is multiplied first, so that neither factor
-    overflows and a subnormal result is rounded only in the last product.
+    |n| must be at most 2000. The factor 2^n is divided into two factors, so that
+    neither factor overflows and a subnormal result is rounded only in the last product.
     """
     half = exponent >> 1
     first = ((half << 52) + ONE_BITS).number()
@@ -495,7 +497,7 @@ def two_sum(a: Value, b: Value) -> DoubleDouble:
 
 
 def leading_bits(x: Value, count: int) -> Value:
-    """Return x truncated to a number of binary digits."""
+    """Return x truncated to `count` binary digits."""
     return (x.bits() & -(1 << (53 - count))).number()
 
 
@@ -530,9 +532,10 @@ def quotient(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
 
 
 def rounded_quotient(a: DoubleDouble, b: DoubleDouble) -> Value:
-    """Return the quotient of two double-double numbers to little more than half an ulp.
+    """Return the quotient of two double-double numbers, rounded to one float64.
 
-    The quotient of the high parts is rounded, and the effect of the low parts is added.
+    The error is little more than half an ulp. The quotient of the high parts is
+    rounded, and the effect of the low parts is added.
     """
     first = a[0] / b[0]
     return first + (a[1] - first * b[1]) / b[0]

@@ -1,4 +1,4 @@
-"""Animations of machines by the points and outlines of their parts."""
+"""Animations of machines, drawn from the points and outlines of their parts."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, TYPE_CHECKING
@@ -33,26 +33,29 @@ def animate(
 
     Positions are interpolated linearly between the saved times, so that the frame rate
     is constant for any step sizes. Save the animation with
-    `animation.save("motion.gif")`, or with `"motion.mp4"` if FFmpeg is installed. The
-    axes have equal units. `nhjax.render` draws shapes with light and shadows.
+    `animation.save("motion.gif")`, or with `animation.save("motion.mp4")` if FFmpeg is
+    installed. The axes have equal units. For shapes with light and shadows, use
+    `nhjax.render`.
 
     **Arguments:**
 
     - `ts`: the saved times of one trajectory.
-    - `points`: the saved positions by name. A point has shape (times, 2) or (times, 3).
-        The outline of a body has shape (times, corners, 2) or (times, corners, 3), and
-        is filled. The machines of `nhjax.systems` have a method `points`, whose result
-        `SaveAt(fn=lambda t, y, args: machine.points(t, y.q))` saves. For a run that has
-        saved states, use `jax.vmap(machine.points)(sol.ts, sol.ys.q)`.
-    - `rods`: chains of names of points that are connected by lines, such as
-        `[("hub", "end")]`.
-    - `wheels`: the hub and a point of the rim of each wheel, by name, and in space
-        another point of the axle. Wheels are filled, with a line from the hub to the
-        point of the rim. If this point is fixed in the wheel, the line shows how the
-        wheel turns.
+    - `points`: a dictionary from names to saved positions. A point has shape (times, 2)
+        or (times, 3). The outline of a body has shape (times, corners, 2) or (times,
+        corners, 3), and is filled. The machines of `nhjax.systems` have a method
+        `points`. `SaveAt(fn=lambda t, y, args: machine.points(t, y.q))` saves its
+        results during a run. From saved states, compute them by
+        `jax.vmap(machine.points)(sol.ts, sol.ys.q)`.
+    - `rods`: chains of points that are connected by lines, each a tuple of names such
+        as `("hub", "end")`.
+    - `wheels`: for each wheel the names of its hub and of a point of its rim, and in
+        space also of another point of its axle. Wheels are filled, with a line from the
+        hub to the point of the rim. If this point is fixed in the wheel, the line shows
+        how the wheel turns.
     - `traced`: the names of points whose past paths are drawn.
     - `ground`: the height of the ground, which is drawn below the machine.
-    - `follow`: the name of a point that stays in the centre of the picture.
+    - `follow`: the name of a point that stays in the centre of the picture. By default
+        the picture does not move.
     - `speed`: the number of seconds of the motion in one second of the animation.
     - `frame_rate`: the number of frames per second.
     - `ax`: the axes to draw into; points in space need a 3d projection.
@@ -143,7 +146,7 @@ def animate(
 
     if spatial:
         ax.set_box_aspect(tuple(sides))  # pyright: ignore[reportArgumentType]
-        # `zorder` puts lines and marks in front of filled bodies and wheels.
+        # With this setting `zorder` puts lines and marks in front of filled bodies.
         axes: Any = ax
         axes.computed_zorder = False
     else:
@@ -202,9 +205,10 @@ def _check_point(argument: str, name: Any, moving: dict[str, np.ndarray]) -> Non
 
 
 def _frame_times(times: np.ndarray, spacing: float) -> np.ndarray:
-    """Return the times of the frames, with constant spacing from the first time on."""
+    """Return the times of the frames, equally spaced from the first saved time on."""
     duration = abs(times[-1] - times[0])
-    # The last frame is at most half a frame from the last saved time.
+    # The last frame is at most half the spacing of frames away from the last saved
+    # time.
     shown = spacing * np.arange(round(duration / spacing) + 1)
     return times[0] + np.sign(times[-1] - times[0]) * np.minimum(shown, duration)
 
@@ -220,7 +224,7 @@ def _at(shown: np.ndarray, times: np.ndarray, positions: np.ndarray) -> np.ndarr
 def _window(
     frames: dict[str, np.ndarray], follow: str | None
 ) -> tuple[np.ndarray, float]:
-    """Compute the centre of the picture in each frame, and half its width."""
+    """Compute the centre of the picture in each frame, and half the picture's width."""
     everything = np.concatenate(
         [x.reshape(len(x), -1, x.shape[-1]) for x in frames.values()], axis=1
     )
@@ -230,7 +234,7 @@ def _window(
     else:
         centres = frames[follow]
     reach = np.max(np.abs(everything - centres[:, None]))
-    # A single point at rest has size zero.
+    # For a single point at rest the computed width is zero, and 1 is used instead.
     return centres, 1.05 * float(reach) or 1.0
 
 

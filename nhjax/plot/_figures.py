@@ -43,11 +43,11 @@ def trajectory(
     - `sol`: a `Solution` with saved states; for a batch, one path is drawn for each
         member.
     - `coordinates`: the indices of two or three entries of q, or their names if the
-        system has `coordinates`. On a group, an index selects one of the flattened
-        numbers of an element; on a product, the numbers of all factors are joined in
-        order.
-    - `names`: the labels of the axes. The default is the names of the system, or
-        q₁, q₂, ....
+        system has `coordinates`. On a group, an index selects one entry of the
+        flattened array of a group element. On a product of groups, the flattened arrays
+        of all factors are joined in order.
+    - `names`: the labels of the axes. The default is the names that the system has for
+        its coordinates, or q₁, q₂, ....
     - `ground`: the value of the third coordinate at which a plane is drawn.
     - `ax`: the axes to draw into; three coordinates need a 3d projection.
     - `style`: passed on to `Axes.plot`.
@@ -76,8 +76,8 @@ def trajectory(
     parts = [np.asarray(leaf).reshape(*lead, -1) for leaf in jax.tree.leaves(ys.q)]
     q = np.concatenate(parts, axis=-1)
     n = q.shape[-1]
-    # On a group, a system has one name for each velocity, but an element of the group
-    # has more numbers.
+    # On a group, the names belong to the velocities. They are not used if an element of
+    # the group has more numbers than there are velocities.
     known = sol.coordinates or ()
     known = known if len(known) == n else ()
     chosen = _indices(coordinates, n, known)
@@ -124,7 +124,7 @@ def _indices(coordinates: Any, n: int, known: tuple[str, ...]) -> list[int]:
 
 
 def _set_box(ax: Any, ground: float | None) -> None:
-    """Set the proportions of the box to the proportions of the data, at most 2 : 1."""
+    """Give the box the proportions of the data, with a ratio of at most 2 : 1."""
     if ground is not None:
         low, high = ax.get_zlim()
         ax.set_zlim(min(low, ground), max(high, ground))
@@ -201,8 +201,8 @@ def constraint(
 ) -> "Axes":
     """Draw the values of the constraint functions at the saved states against time.
 
-    The figure shows Φ_a for each nonholonomic constraint, and dΓ_a/dt and Γ_a for each
-    holonomic constraint.
+    For each nonholonomic constraint the figure shows the value Φ_a, and for each
+    holonomic constraint the value Γ_a and its time derivative dΓ_a/dt.
 
     **Arguments:**
 
@@ -248,7 +248,7 @@ def convergence(
 
     - `step_sizes`, `errors`: vectors of the same length; errors that are not positive
         are ignored.
-    - `order`: the slope of a dashed reference line, which is drawn below the errors
+    - `order`: the slope of a dashed reference line. The line is drawn below the errors
         and labelled with its slope.
     - `ax`: the axes to draw into.
     - `style`: passed on to `Axes.plot`.
@@ -277,8 +277,9 @@ def convergence(
     if order is not None and not isinstance(order, int | float | np.number):
         raise TypeError(f"`order` must be a number or None, got {order!r}.")
     if order is not None:
-        # The largest step may not be in the asymptotic regime, and the error of the
-        # smallest step may be round-off.
+        # The reference line is placed relative to the error at the middle step size,
+        # because the largest step may not be in the asymptotic regime, and the error of
+        # the smallest step may be round-off.
         middle = np.argsort(h)[len(h) // 2]
         reference = 0.3 * e[middle] * (h / h[middle]) ** order
         ax.plot(h, reference, linestyle="--", linewidth=0.8, color=line.get_color())

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# The colours of Okabe and Ito, which colour-blind readers can tell apart.
+# The colours of Okabe and Ito, which colour-blind readers can distinguish.
 COLOURS = {
     "blue": "#0072B2",
     "vermilion": "#D55E00",
@@ -32,14 +32,15 @@ ON_DARK = ("sky", "orange", "green", "yellow", "purple", "vermilion", "blue")
 def style(*, dark: bool = False) -> contextlib.ExitStack:
     """Set matplotlib's settings to the style of the figures of nhjax.
 
-    The style sets the colours of Okabe and Ito, which colour-blind readers can tell
-    apart, and the sizes, widths, grid, layout and resolution of figures. Call `style`
-    once for all figures that follow, or use it in a `with` statement, which restores
-    the previous settings at its end.
+    The style sets the colours of Okabe and Ito, which colour-blind readers can
+    distinguish, and the sizes, widths, grid, layout and resolution of figures. A call
+    of `style` affects all figures that are created later. In a `with` statement,
+    `style` affects the figures in the block, and restores the previous settings at the
+    end of the block.
 
-    The functions of `nhjax.plot` use the light style by themselves for the figures
-    that they create. They keep every setting that you have changed from matplotlib's
-    default, for instance by this function with `dark=True`.
+    Without a call of `style`, the functions of `nhjax.plot` use the light style for the
+    figures that they create. They do not change a setting that differs from
+    matplotlib's default, because you have set it, for instance by `style(dark=True)`.
 
     **Arguments:**
 
@@ -62,7 +63,7 @@ def style(*, dark: bool = False) -> contextlib.ExitStack:
 
 
 def styled(draw: Callable[P, R]) -> Callable[P, R]:
-    """Let a function draw in the style if it creates its figure."""
+    """Let a function draw in the light style if it creates the figure itself."""
 
     @functools.wraps(draw)
     def drawn(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -84,7 +85,7 @@ def styled(draw: Callable[P, R]) -> Callable[P, R]:
 
 
 def grey(level: float) -> str:
-    """Return a grey between the colours of text (0) and of the background (1)."""
+    """Return a grey between the colour of text (level 0) and of the background (1)."""
     from matplotlib import colors, rcParams
 
     light = sum(colors.to_rgb(rcParams["text.color"])) > 1.5
@@ -101,8 +102,8 @@ def new_axes(ax: "Axes | None", projection: str | None = None) -> "Axes":
                 f"{type(ax).__name__}."
             )
         return ax
-    # The import is here, because drawing into the user's axes must not choose a backend
-    # of matplotlib.
+    # The import is inside the function, because drawing into the user's axes must not
+    # choose a backend of matplotlib.
     from matplotlib import pyplot as plt
 
     keywords = {} if projection is None else {"projection": projection}
@@ -113,7 +114,7 @@ def _set(settings: dict[str, Any]) -> contextlib.ExitStack:
     from matplotlib import rcParams
 
     current: Any = rcParams
-    # `rc_context` is not used, because it restores the settings when it is
+    # `rc_context` is not used, because it would restore the settings as soon as it is
     # garbage-collected.
     restoration = contextlib.ExitStack()
     restoration.callback(current.update, {name: current[name] for name in settings})
@@ -141,7 +142,7 @@ def _settings(dark: bool) -> dict[str, Any]:
         "axes.axisbelow": True,
         "grid.color": grid,
         "grid.linewidth": 0.6,
-        # Labels show 0.05 instead of 5 × 10⁻².
+        # With this setting the labels of axes show 0.05 instead of 5 × 10⁻².
         "axes.formatter.min_exponent": 2,
         "axes.spines.top": False,
         "axes.spines.right": False,

@@ -32,7 +32,8 @@ from ._result import (
 )
 
 
-# The studies that `nhjax list` shows. Keyword arguments of a study are its options.
+# The studies that `nhjax list` shows. The keyword arguments of a study are the options
+# of its command.
 STUDIES: Mapping[str, Callable[..., AbstractStudyResult]] = MappingProxyType(
     {
         "particle-order": particle_order,

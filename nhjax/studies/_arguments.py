@@ -20,13 +20,13 @@ QUICK: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         "cvt-energy": {"final_time": 200.0, "dt": (0.1,)},
         "chaotic-energy": {"stages": (2,), "final_time": 40.0, "members": 20},
         "unicycle-order": {"stages": (2, 3), "dt": (0.25, 0.125)},
-        # One fifth of this run is the time that the ball takes for a circle.
+        # The ball moves once around its circle in one fifth of this run.
         "ball-invariants": {"stages": (3,), "dt": (0.2, 0.1), "num_steps": 1000},
     }
 )
 # For each study: the seconds to compile a program, the seconds per step of a trajectory
-# (both measured on two cores of 2 GHz), and whether each pair (s, h) is compiled
-# separately, instead of each s.
+# (both measured on two cores of 2 GHz), and whether the study compiles a program for
+# each pair (s, h). Otherwise it compiles one program for each s.
 _COSTS: Mapping[str, tuple[float, float, bool]] = MappingProxyType(
     {
         "particle-order": (4.0, 1e-5, False),
@@ -42,8 +42,7 @@ _START_SECONDS = 4.0
 class ArgumentError(ValueError):
     """Raised if an argument of a study is invalid.
 
-    `argument` is the name of the argument, from which the command line finds the
-    option.
+    `argument` is the name of the argument. The command line uses it to find the option.
     """
 
     def __init__(self, argument: str, problem: str):
@@ -138,7 +137,7 @@ def _estimated_time(name: str, chosen: Mapping[str, Any]) -> str:
     steps = [chosen.get("num_steps", length / h if h > 0 else 0) for h in dt]
     trajectories = chosen.get("members", 0) + 1
     trajectories *= len(chosen.get("regimes", ("",)))
-    # The cost of an iteration is proportional to s.
+    # The time of an iteration is proportional to s.
     runs = step_seconds * sum(steps) * trajectories * sum(stages) / 2
     seconds = _START_SECONDS + compile_seconds * programs + runs
     if not math.isfinite(seconds):

@@ -46,7 +46,7 @@ LINEAR_INTEGRALS = {
     "rω_η-Ωy/(1+a)": r"$r\omega_\eta - \Omega y/(1 + a)$",
 }
 MOVING_ENERGY = "moving energy"
-# Errors of the moving energy and of the position that are round-off.
+# Errors of the moving energy and of the position up to these values are round-off.
 ENERGY_FLOOR, POSITION_FLOOR = 4e-15, 1e-13
 
 
@@ -56,11 +56,11 @@ class BallRun:
 
     - `integrals`: shape (k + 1, 4), the three linear first integrals and the moving
         energy.
-    - `positions`: (x, y), shape (k + 1, 2).
+    - `positions`: the horizontal position (x, y) of the ball, of shape (k + 1, 2).
     - `circle_deviation`: the distance from the exact position at the common final time
         of all step sizes.
-    - `timing`: the times to compile and to run the program that runs all step sizes
-      with this s side by side.
+    - `timing`: the times to compile and to run one program, which runs all step sizes
+      with this s in one `jax.vmap`.
     """
 
     stages: int
@@ -74,7 +74,7 @@ class BallRun:
     timing: Timing
 
     def deviations(self) -> np.ndarray:
-        """Return the first integrals minus their initial values."""
+        """Return the values of the first integrals minus their initial values."""
         return self.integrals - self.integrals[0]
 
     def largest_linear_errors(self) -> np.ndarray:
@@ -166,7 +166,7 @@ class BallInvariants(AbstractStudyResult):
         return data
 
     def table(self) -> str:
-        """Format a table of the largest errors of each run, with orders."""
+        """Format a table of the largest errors of each run, and of observed orders."""
         header = ["s", "h"]
         header += [f"|Δ({name})|" for name in LINEAR_INTEGRALS]
         header += ["|ΔE_m| 1/5", "|ΔE_m| 5/5", "slope"]
@@ -198,7 +198,7 @@ class BallInvariants(AbstractStudyResult):
         )
 
     def figures(self) -> "dict[str, Figure]":
-        """Draw the errors of the four integrals against time, a figure for each s."""
+        """Draw the errors of the four integrals against time, one figure for each s."""
         return {f"{self.name}-s{s}": self._figure(s) for s in self.stages}
 
     def _with_slopes(self, s: int) -> "zip[tuple[BallRun, float, float]]":
@@ -212,7 +212,8 @@ class BallInvariants(AbstractStudyResult):
         axes = figure.subplots(2, 2, sharex=True).flat
         labels = [*LINEAR_INTEGRALS.values(), MOVING_ENERGY]
         for i, (ax, label) in enumerate(zip(axes, labels, strict=True)):
-            # The errors of the moving energy differ by orders of magnitude.
+            # The errors of the moving energy differ by orders of magnitude between step
+            # sizes.
             logarithmic = label == MOVING_ENERGY
             # Draw the largest step first, so that it does not hide the others.
             for k, run in enumerate(self.of_stages(s)):
@@ -248,21 +249,22 @@ def ball_invariants(
 
     This is the fifth experiment of the paper. For one step size, Lobatto-3 and the
     Cayley map, the paper plots the errors of the four first integrals against time.
-    Three are linear and are conserved to the tolerance of the nonlinear solver, which
-    is 1e-12 in the paper and round-off here. The fourth, the moving energy, oscillates
-    like the energy of a holonomic system. In addition, this study measures whether the
-    moving energy stays bounded, its order, and the distance of the ball from its exact
-    position on a circle. The paper does not give its data; this study uses the data
-    of `nhjax.systems.TurntableBall`, a solid ball whose constraints are written in the
-    spatial angular velocity.
+    Three of the integrals are linear and are conserved to the tolerance of the
+    nonlinear solver, which is 1e-12 in the paper and round-off here. The error of the
+    fourth integral, the moving energy, oscillates like the energy error of a holonomic
+    system. In addition, this study measures whether the error of the moving energy
+    stays bounded, the order of this error, and the distance of the ball from its exact
+    position on a circle. The paper does not state the data of its example; this study
+    uses the data of `nhjax.systems.TurntableBall`, a solid ball whose constraints are
+    written in terms of the spatial angular velocity.
 
     **Arguments:**
 
     - `stages`: the numbers of stages s.
     - `dt`: the step sizes h.
-    - `num_steps`: the length of every run in steps, at least 5. Positions are compared
-        at the end of the run with the smallest step. This time must be a whole number
-        of steps in every other run.
+    - `num_steps`: the number of steps of every run, at least 5. Positions are compared
+        at the time at which the run with the smallest step ends. This time must be a
+        whole number of steps of every other step size.
     - `closure`: the closure of the multipliers, as for `nhjax.LobattoIIIAB`; by default
         the closure of the paper.
     - `retraction`: `"cayley"`, as in the paper, or `"exponential"`.
@@ -307,7 +309,7 @@ def _runs(
     position: np.ndarray,
     progress: bool,
 ) -> list[BallRun]:
-    """Run all step sizes side by side."""
+    """Run all step sizes in one `jax.vmap`."""
     y0 = ball.initial_state()
 
     def observe(t, y, args):

@@ -42,8 +42,9 @@ if TYPE_CHECKING:
 
 
 TIMES = (10.0, 50.0, 100.0, 200.0)
-# μ(E, k) is averaged over an interval of this length on each side of a time, because
-# its value at one step fluctuates with the fast motion of the system.
+# The mean squared energy error μ(E, k) is averaged over an interval of this length on
+# each side of a time, because the value of μ at one step fluctuates with the fast
+# motion of the system.
 WINDOW = 5.0
 # The largest number of members that run at a time, and the largest number of bytes of
 # their saved energies, so that memory does not grow with the number of members.
@@ -58,7 +59,8 @@ class ChaoticRun:
 
     - `mu`, `mu_error`: the mean squared energy error μ(E, k) at the saved times, and
         its standard error σ/√N over the N members.
-    - `windows`, `windows_error`: the same for averages over windows in time.
+    - `windows`, `windows_error`: the mean squared error averaged over a window around
+        each reported time, and its standard error.
     """
 
     stages: int
@@ -95,7 +97,7 @@ class ChaoticEnergy(AbstractStudyResult):
     def slopes(self, s: int) -> np.ndarray:
         """Return log-log slopes of the window means, of shape (step sizes, times).
 
-        The first row is NaN, because it has no larger step to compare with.
+        The first row is NaN, because there is no larger step size to compare with.
         """
         means = np.stack([run.windows for run in self.of_stages(s)])
         return slopes(self.dt, means)
@@ -215,22 +217,23 @@ def chaotic_energy(
     """Compute the mean squared energy error of an ensemble of the chaotic system.
 
     This is the third experiment of the paper: J + 1 motions of a system with 7
-    coordinates on one energy surface. μ(E, k), the mean of (E_jk - E_0)² over the
-    ensemble at step k, scales as h^{4(s-1)}. Every motion is chaotic, so that only such
-    statistics can be compared. Members run in chunks and statistics are updated after
-    each chunk, so that memory does not grow with J. The error bar of μ is its standard
-    error.
+    coordinates on one energy surface. E_jk is the energy of member j at step k. The
+    mean of (E_jk - E_0)² over the ensemble, μ(E, k), scales as h^{4(s-1)}. Every motion
+    is chaotic, so that only statistics of the ensemble can be compared, and not single
+    motions. Members run in chunks and statistics are updated after each chunk, so that
+    memory does not grow with J. The error bar of μ is its standard error.
 
     **Arguments:**
 
     - `stages`: the numbers of stages s.
     - `dt`: the step sizes h, each of which must divide `final_time`.
     - `final_time`: the length of each run.
-    - `members`: J of the paper; the ensemble has J + 1 members.
+    - `members`: the number J of the paper; the ensemble has J + 1 members.
     - `closure`: the closure of the multipliers, as for `nhjax.LobattoIIIAB`; by default
         the closure of the paper.
-    - `times`: the times at which to report μ, averaged over a window of ±5; by default
-        the times 10, 50, 100 and 200 within the run, or its end for a shorter run.
+    - `times`: the times at which to report μ, averaged over a window of ±5. The default
+        is those of the times 10, 50, 100 and 200 that lie within the run, or the final
+        time of a run that is shorter than 10.
     - `save_every`: the number of steps between saved energies.
     - `progress`: whether to show a progress bar for each run on the standard error
         stream.
@@ -323,7 +326,7 @@ def _run(
 ) -> ChaoticRun:
     """Run the ensemble, and average over a window around each of `times`."""
     every = min(case.save_every, case.num_steps)
-    # `integrate` computes times as products, too.
+    # `integrate` also computes times as products of the step number and h.
     ts = case.h * np.arange(0, case.num_steps + 1, every)
     weights = np.abs(ts - np.asarray(times)[:, None]) <= WINDOW + 1e-9
     weights = weights / np.sum(weights, axis=1, keepdims=True)
@@ -342,7 +345,7 @@ def _run(
         )
 
     start = time.perf_counter()
-    # This compiles, and runs one chunk.
+    # This call compiles the program, and runs one chunk.
     outcome(size, False)
     compiled = time.perf_counter()
     whole = outcome(members + 1, progress)
@@ -412,8 +415,8 @@ def _figure(runs: list[ChaoticRun], title: str) -> "Figure":
 
 
 def _panel(ax: "Axes", runs: list[ChaoticRun], power: int) -> None:
-    # The error starts from zero. To include the first steps in the limits of the axis
-    # would compress the curves.
+    # The error starts from zero. Limits of the axis that include the first steps would
+    # compress the curves.
     levels = []
     for i, run in enumerate(runs):
         h, times = run.dt, run.times
@@ -422,7 +425,8 @@ def _panel(ax: "Axes", runs: list[ChaoticRun], power: int) -> None:
         ax.plot(times, scaled, linewidth=0.4, alpha=0.35, color=f"C{i}")
         mean = _smoothed(scaled)
         ax.plot(times, mean, color=f"C{i}", linewidth=1.5, label=f"$h$ = {h:g}")
-        # Errors at neighbouring times are correlated, so that they do not average out.
+        # Statistical errors at neighbouring times are correlated, so that the running
+        # mean has the same standard error as a single time.
         ax.fill_between(
             times, mean - spread, mean + spread, color=f"C{i}", alpha=0.2, linewidth=0
         )

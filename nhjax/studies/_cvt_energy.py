@@ -47,8 +47,8 @@ class CVTRun:
     """The energies of one run of k steps, at every step.
 
     - `energies`: shape (k + 1, 3): total, driver and passenger.
-    - `timing`: the times to compile and to run the program that runs all regimes with
-      this s and h side by side.
+    - `timing`: the times to compile and to run one program, which runs all regimes with
+      this s and h in one `jax.vmap`.
     """
 
     regime: str
@@ -140,7 +140,7 @@ class CVTEnergy(AbstractStudyResult):
         return data
 
     def table(self) -> str:
-        """Format a table of the energy errors in each fifth of a run, with ranges."""
+        """Format a table of the energy errors in each fifth of a run, and ranges."""
         header = ["regime", "s", "h"]
         header += [f"max|E-E0| {i}/5" for i in range(1, 6)]
         header += ["range of ΔE_d", "range of ΔE_p", "run s"]
@@ -171,7 +171,7 @@ class CVTEnergy(AbstractStudyResult):
         return f"the energy error grows after the first fifth in: {'; '.join(grown)}"
 
     def figures(self) -> "dict[str, Figure]":
-        """Draw short and long term of each regime and step size, as in the paper."""
+        """Draw short-term and long-term energy errors of each regime and step size."""
         cases = dict.fromkeys((run.regime, run.dt) for run in self.runs)
         return {
             f"{self.name}-{regime}-h{h:.4g}": self._figure(regime, h)
@@ -216,22 +216,23 @@ def cvt_energy(
     short_time: float = 100.0,
     progress: bool = False,
 ) -> CVTEnergy:
-    """Compute the energies of the CVT, its driver and passenger over a long time.
+    """Compute the energies of the CVT, of its driver and of its passenger in long runs.
 
     This is the second experiment of the paper, on a continuously variable transmission
-    (CVT). The driver oscillates at low energy and rotates at high energy. The driver
-    and the passenger each conserve their energy.
+    (CVT). The driver is a pendulum, which oscillates at low energy and rotates at high
+    energy. In the exact motion, the energies of the driver and of the passenger are
+    conserved separately.
 
     **Arguments:**
 
-    - `regimes`: `"low"`, `"high"` or both, the energies of the motion.
+    - `regimes`: the energies of the driver: `"low"`, `"high"` or both.
     - `stages`: the numbers of stages s.
     - `dt`: the step sizes h.
-    - `final_time`: the length of each run, to the nearest whole step.
+    - `final_time`: the length of each run, rounded to a whole number of steps.
     - `closure`: the closure of the multipliers, as for `nhjax.LobattoIIIAB`; by default
         the closure of the paper.
-    - `epsilon`: the perturbation ε of the pendulum.
-    - `short_time`: the duration that the figures of the short term show.
+    - `epsilon`: the perturbation ε of the pendulum's potential.
+    - `short_time`: the length of the time interval in the figures of short-term errors.
     - `progress`: whether to show a progress bar for each s and h on the standard error
         stream.
 
@@ -278,7 +279,7 @@ def _runs(
     epsilon: float,
     progress: bool,
 ) -> list[CVTRun]:
-    """Run all regimes side by side."""
+    """Run all regimes in one `jax.vmap`."""
     cvt = ContinuouslyVariableTransmission(epsilon)
     system = cvt.system
 
@@ -294,7 +295,8 @@ def _runs(
             dt=h,
             num_steps=round(final_time / h),
             saveat=SaveAt(t0=True, steps=True, fn=energies),
-            # h = π/10 is a large step for the rotating driver.
+            # For the rotating driver, h = π/10 is a large step, which needs Newton's
+            # method.
             stage_solver=Newton(),
             throw=False,
             progress_meter=meter(progress, f"s = {method.stages}, h = {h:.4g}"),

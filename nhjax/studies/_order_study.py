@@ -80,8 +80,9 @@ class ExactExample(Protocol):
 class AbstractOrderStudy(AbstractStudyResult):
     """The result of a study of orders: relative errors at the final time.
 
-    - `errors`: shape (stages, step sizes, quantities). `multiplier` is the multiplier
-        that the method reports, `continuous_multiplier` is λ_c(q, p).
+    - `errors`: shape (stages, step sizes, quantities). The quantity `multiplier` is the
+        multiplier that the method reports, and `continuous_multiplier` is λ_c(q, p),
+        the multiplier of the continuous equations.
     - `timings`: one for each number of stages.
     """
 
@@ -96,7 +97,7 @@ class AbstractOrderStudy(AbstractStudyResult):
     timings: list[Timing]
 
     def slopes(self) -> np.ndarray:
-        """Return observed orders in the shape of `errors`; NaN for round-off errors."""
+        """Return observed orders, of the shape of `errors`, or NaN at round-off."""
         # The errors of a run to T = 3 stagnate below 1e-14.
         return np.stack([slopes(self.dt, e, floor=1e-13) for e in self.errors])
 
@@ -154,7 +155,7 @@ class AbstractOrderStudy(AbstractStudyResult):
         }
 
     def table(self) -> str:
-        """Format a table of errors and slopes at every step size, then the orders."""
+        """Format a table of errors and slopes at each step size, and of orders."""
         symbols = [SYMBOLS[name][0] for name in self.quantities]
         header = ["s", "h"]
         for symbol in symbols:
@@ -179,7 +180,7 @@ class AbstractOrderStudy(AbstractStudyResult):
         return f"{format_table(header, rows)}\n\nobserved (expected) orders\n{summary}"
 
     def verdict(self) -> str:
-        """State whether the orders agree with theory."""
+        """State whether the observed orders agree with theory."""
         expected = np.array([self._expected(s) for s in self.stages])
         off = np.abs(self.orders() - expected)
         if not np.any(np.isfinite(off)):
@@ -188,7 +189,8 @@ class AbstractOrderStudy(AbstractStudyResult):
                 "round-off"
             )
         worst = np.nanmax(off)
-        # With many stages, the largest steps are not in the asymptotic regime.
+        # The tolerance of 0.5 is large because with many stages the largest steps are
+        # not in the asymptotic regime.
         agree = "agree with theory" if worst <= 0.5 else "do not all agree with theory"
         names = ", ".join(SYMBOLS[name][0] for name in self.quantities)
         return f"the orders of {names} {agree}; the largest difference is {worst:.2f}"
@@ -215,7 +217,7 @@ class AbstractOrderStudy(AbstractStudyResult):
                 )
             ax.set_ylabel(f"relative error of {SYMBOLS[name][1]}")
             ax.set_xticks(self.dt, [f"{h:.4g}" for h in self.dt], rotation=45)
-            # Above an empty panel, shared axes would have no tick labels.
+            # With shared axes, a panel above an empty panel would have no tick labels.
             ax.tick_params(labelbottom=True)
             ax.minorticks_off()
             # Leave space for the legend.
@@ -230,15 +232,15 @@ class AbstractOrderStudy(AbstractStudyResult):
 
     def _expected(self, s: int) -> tuple[int, ...]:
         order = 2 * s - 2
-        # Only the propagated closure reports its own multiplier, λ = Λ^s; the other
-        # closures report λ_c.
+        # Only the propagated closure reports its own multiplier, λ = Λ^s. The other
+        # closures report the continuous multiplier λ_c.
         own = s - s % 2 if self.closure == "propagated" else order
         return tuple(own if name == "multiplier" else order for name in self.quantities)
 
 
 @dataclasses.dataclass(frozen=True)
 class ParticleOrder(AbstractOrderStudy):
-    """The errors of the nonholonomic particle at the final time, by stages and step.
+    """Errors of the nonholonomic particle at the final time, by stages and step size.
 
     - `errors`: relative errors, of shape (stages, step sizes, 4), of q, p, the
         multiplier λ that the method reports, and the continuous multiplier λ_c(q, p).
@@ -265,8 +267,9 @@ def particle_order(
 ) -> ParticleOrder:
     """Measure the orders of q, p and the multiplier on the nonholonomic particle.
 
-    This is the first experiment of the paper, compared with the exact solution. The
-    same study runs on Chaplygin's sleigh, whose mass matrix depends on position.
+    This is the first experiment of the paper. The results are compared with the exact
+    solution. The same study can run on Chaplygin's sleigh, whose mass matrix depends on
+    position.
 
     **Arguments:**
 
@@ -326,8 +329,8 @@ def unicycle_order(
 ) -> UnicycleOrder:
     """Measure the orders of g, v, p and the multiplier on the unicycle, on SE(2).
 
-    This is the fourth experiment of the paper. The paper compares with its own method
-    at h = 1e-4; this study compares with the exact solution.
+    This is the fourth experiment of the paper. The paper compares its results with a
+    run of its own method at h = 1e-4; this study compares with the exact solution.
 
     **Arguments:**
 
@@ -426,8 +429,8 @@ def _final_values(
     num_steps: list[int],
 ) -> tuple[list[tuple[np.ndarray, ...]], Timing]:
     """Compute the quantities at the end of the run with each step size."""
-    # One compiled program runs all step sizes with the same number of steps. States
-    # after the final time are ignored.
+    # One compiled program runs all step sizes, each for the largest number of steps.
+    # States after the final time are ignored.
     system = example.system
     start = example.initial_state()
 

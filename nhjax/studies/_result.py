@@ -102,7 +102,7 @@ def compile_and_run(function: Callable[..., Any], *args: Any) -> tuple[Any, Timi
     program = jax.jit(function).lower(*args).compile()
     compiled = time.perf_counter()
     value = jax.block_until_ready(program(*args))
-    # The callbacks of progress meters may end after the program.
+    # The callbacks of progress meters may end later than the program.
     jax.effects_barrier()
     return value, Timing(compiled - start, time.perf_counter() - compiled)
 
@@ -110,12 +110,12 @@ def compile_and_run(function: Callable[..., Any], *args: Any) -> tuple[Any, Timi
 def meter(
     progress: bool, description: str, unit: str = "step"
 ) -> AbstractProgressMeter:
-    """Create a progress bar on the standard error stream, or no bar."""
+    """Create a progress bar on the standard error stream, or a meter without output."""
     return TqdmProgressMeter(description, unit) if progress else NoProgressMeter()
 
 
 def system_parameters(example: Any) -> dict[str, Any]:
-    """Return the parameters of an example of the gallery without the initial data."""
+    """Return the parameters of an example of the gallery, without its initial data."""
     values = {
         field.name: getattr(example, field.name)
         for field in dataclasses.fields(example)
@@ -169,7 +169,7 @@ if TYPE_CHECKING:
 # The colours of Okabe and Ito, which colour-blind readers can distinguish; most of them
 # also differ in a grey print.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
-# The number of bins of an envelope: so small that the envelope has smooth edges.
+# The number of bins of an envelope. With so few bins the envelope has smooth edges.
 BINS = 200
 
 
@@ -196,11 +196,11 @@ def largest_by_fifths(error: np.ndarray) -> list[float]:
 def slopes(
     step_sizes: Sequence[float] | np.ndarray, errors: np.ndarray, floor: float = 0.0
 ) -> np.ndarray:
-    """Compute observed orders in the shape of `errors`, with NaN for undefined ones.
+    """Compute observed orders in the shape of `errors`, with NaN for undefined orders.
 
-    The first row is NaN, because it has no larger step size to compare with. Orders
-    that involve errors at or below `floor` are NaN too, because these errors are
-    round-off.
+    The first row is NaN, because there is no larger step size to compare with. Orders
+    that are computed from errors at or below `floor` are NaN too, because these errors
+    are round-off.
     """
     above = errors > floor
     order = np.full(errors.shape, np.nan)
@@ -217,8 +217,9 @@ def envelope(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute the minimum and maximum of `values` in each of `bins` time intervals.
 
-    It returns the middles of the intervals, the minima and the maxima. Values that are
-    not finite are ignored; an interval without finite values gives NaN.
+    The results are the middles of the intervals, the minima and the maxima. Values that
+    are not finite are ignored; the minimum and maximum of an interval without finite
+    values are NaN.
     """
     starts = np.linspace(0, len(times), bins + 1).astype(int)[:-1]
     finite = np.isfinite(values)

@@ -24,12 +24,12 @@ class AndrewsSqueezer(AbstractExample):
     Φ = (P₂ - P₃, P₂ - P₄, P₂ - P₆),  Q = (M, 0, 0, 0, 0, 0, 0),
 
     with q = (β, θ, γ, φ, δ, Ω, ε) [rad]. The bodies K1 to K7 have the angles β,
-    β + θ, γ, φ + δ, δ, Ω + ε and ε. Each turns about its inner joint: K1 about the
+    β + θ, γ, φ + δ, δ, Ω + ε and ε. Each body turns about its inner joint: K1 about the
     origin O, K2 about the end of K1, K3 about B, K5 and K7 about A, K4 about the end
     of K5, K6 about the end of K7. c_k are the centres of mass and P_k the outer ends,
-    and the ends of K2, K3, K4 and K6 meet in one joint P. A spring pulls at the point D
-    of K3 from C; a motor turns K1 with the torque M,
-    and K1 reaches nearly 11 000 revolutions a minute within 0.03 s.
+    and the ends of K2, K3, K4 and K6 meet in one joint P. A spring connects the point D
+    of K3 with the fixed point C. A motor turns K1 with the torque M, so that K1 reaches
+    nearly 11 000 revolutions a minute within 0.03 s.
 
     **Parameters:** `masses` m_k [kg] and `inertias` I_k about the centres [kg m²], of
     shape (7,); `arms` and `centres`, the vectors from the inner joint to the outer end
@@ -107,7 +107,7 @@ class AndrewsSqueezer(AbstractExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         return LagrangianSystem(
             self.lagrangian, holonomic=self.holonomic, force=self.force
         )
@@ -131,7 +131,7 @@ class AndrewsSqueezer(AbstractExample):
         return jnp.zeros_like(v).at[0].set(self.torque.astype(v.dtype))
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Compute the energy minus the work M β of the motor, which is conserved."""
+        """Compute the conserved difference of the energy and the motor's work M β."""
         return {"energy_less_work": self.energy(t, q, v) - self.torque * q[0]}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
@@ -159,7 +159,7 @@ class AndrewsSqueezer(AbstractExample):
 
 
 def _body_angles(q: Float[Array, " 7"]) -> Float[Array, " 7"]:
-    """Compute the angles of K1 to K7 in space from the coordinates, or their rates."""
+    """Compute the angles of K1 to K7 in space from q, or their rates from v."""
     beta, theta, gamma, phi, delta, omega, epsilon = q
     return jnp.stack(
         [beta, beta + theta, gamma, phi + delta, delta, omega + epsilon, epsilon]

@@ -19,9 +19,10 @@ class Appell(AbstractConstrainedExample):
 
     L = m/2 (ẋ² + ẏ² + ż²) - mgz,  Φ = ½ (ẋ² + ẏ² - κ²ż²),  q = (x, y, z).
 
-    Φ is homogeneous and nonlinear in the velocities, and the reaction is Chetaev's,
-    λ D2Φ. The particle falls along a straight line with acceleration g/(1 + κ²). At
-    ż = 0 the constraint is singular: D2Φ vanishes.
+    Φ is homogeneous and nonlinear in the velocities. By Chetaev's rule the reaction is
+    λ D2Φ, with the derivative D2Φ of Φ with respect to the velocities. The particle
+    falls along a straight line with acceleration g/(1 + κ²). At ż = 0 the constraint is
+    singular, because D2Φ is zero there.
 
     **Parameters:** `mass` m [kg], `gravity` g [m/s²], `ratio` κ [1].
 
@@ -63,7 +64,7 @@ class Appell(AbstractConstrainedExample):
         }
 
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Compute (q, v, λ) at `t`, for consistent data while ż keeps its sign."""
+        """Compute (q, v, λ) at `t`, for consistent data as long as ż keeps its sign."""
         q0, v0 = self._consistent_data()
         require_nonzero("v0[2]", v0[2], "the constraint is singular there")
         weight = float(self.mass) * float(self.gravity)

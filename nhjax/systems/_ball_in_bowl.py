@@ -31,16 +31,18 @@ class BallInBowl(AbstractConstrainedGroupExample):
     ℓ = m/2 |ẋ|² + k m a²/2 |ω|² - m g z,  Φ = z - κ/2 (x² + y² + ε z²),
     φ = (ẋ - a (R ω) × n - Ω e₃ × (x - a n))₁₂,  n = ∇Φ/|∇Φ|,
 
-    on SO(3) x R³: q = (attitude, (x, y, z)) with the attitude R a quaternion and the
-    centre of the ball x [m], v = (ω₁, ω₂, ω₃, ẋ, ẏ, ż) with the body angular velocity
-    [1/s]. The centre moves on Φ = 0, a paraboloid (ε = 0) or a sphere of radius 1/κ
-    (ε = 1) with its lowest point at the origin; the bowl is the parallel surface at the
-    distance a below, and n is its normal. The constraints φ, which are affine, mean
-    that the ball does not slip at x - a n. With the multipliers (λ₁, λ₂, μ) the force
-    of the bowl is (λ₁, λ₂, 0) + μ ∇Φ [N].
+    on SO(3) x R³, with q = (R, (x, y, z)): the attitude quaternion and the position of
+    the centre of the ball [m], which is the vector x in φ; v = (ω₁, ω₂, ω₃, ẋ, ẏ, ż)
+    with the body angular velocity ω [1/s]. The centre moves on Φ = 0, a paraboloid
+    (ε = 0) or a sphere of radius 1/κ (ε = 1) with its lowest point at the origin. The
+    bowl is the parallel surface at the distance a below, and n is the normal of both
+    surfaces. The constraints φ, which are affine, mean that the ball does not slip at
+    the contact x - a n. With the multipliers (λ₁, λ₂, μ) the force of the bowl is
+    (λ₁, λ₂, 0) + μ ∇Φ [N].
 
-    Energy is not conserved, but the moving energy E - Ω (m (x ẏ - y ẋ) + k m a² (R ω)₃)
-    is. For a flat bowl, κ = 0, the system is the `TurntableBall`.
+    The energy E is not conserved, but the moving energy
+    E - Ω (m (x ẏ - y ẋ) + k m a² (R ω)₃) is conserved. For a flat bowl, κ = 0, the
+    system is the `TurntableBall`.
 
     **Parameters:** `mass` m [kg]; `radius` a of the ball [m]; `inertia_ratio` k, its
     moment of inertia over m a² [1], 2/5 for a solid ball; `curvature` κ [1/m] of the
@@ -101,7 +103,7 @@ class BallInBowl(AbstractConstrainedGroupExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         return LagrangianSystem(
             self.lagrangian,
             nonholonomic=self.constraint,
@@ -122,10 +124,11 @@ class BallInBowl(AbstractConstrainedGroupExample):
         spin: ArrayLike = 0.0,
         **parameters: Any,
     ) -> "BallInBowl":
-        """Create a rolling ball with its centre at (x, y), which moves at (ẋ, ẏ).
+        """Create a rolling ball with its centre at `position` (x, y).
 
-        `spin` is the part of the angular velocity along the normal n; `parameters` are
-        the parameters of the class. In a sphere the ball is in the lower half.
+        `velocity` (ẋ, ẏ) is the velocity of the centre. `spin` is the component of the
+        angular velocity along the normal n. `parameters` are the parameters of the
+        class. In a sphere the ball is in the lower half.
         """
         ball = cls(**parameters)
         x, y = coordinates(position)
@@ -215,9 +218,9 @@ class BallInBowl(AbstractConstrainedGroupExample):
 def _steady_spin(ball: BallInBowl, rate: Array) -> Array:
     """Compute the spin that keeps a moving ball on its circle.
 
-    The moment a n × F = -I ω' of the force F of the bowl is along the path, and ω turns
-    about the vertical with the ball at the given rate. `ball` is on the first axis and
-    has no spin.
+    The balance of moments about the centre, I ω' = -a n × F with the force F of the
+    bowl, determines the spin. On the circle, ω turns about the vertical at the given
+    rate, so that ω' is along the path. `ball` is on the first axis and has no spin.
     """
     normal, path = ball.bowl.normal(ball.q0[1]), ball.q0[1][0]
     moment = normal[0] * ball.gravity + normal[2] * rate**2 * path
@@ -241,7 +244,7 @@ class Bowl(eqx.Module):
     shape: Shape = eqx.field(static=True)
 
     def value(self, x: Vector3) -> Array:
-        """Compute the function Φ that vanishes on the bowl, at a point."""
+        """Compute at a point the function Φ, which is zero on the surface."""
         round_part = x if self.shape == "sphere" else x[:2]
         return x[2] - 0.5 * self.curvature * (round_part @ round_part)
 
@@ -253,7 +256,7 @@ class Bowl(eqx.Module):
         return inward.at[2].add(1.0)
 
     def normal(self, x: Vector3) -> Vector3:
-        """Compute the normal ∇Φ/|∇Φ| at a point, which points into the bowl."""
+        """Compute the normal ∇Φ/|∇Φ| at a point; this vector points into the bowl."""
         slope = self.slope(x)
         return slope / jnp.sqrt(slope @ slope)
 

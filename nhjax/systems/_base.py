@@ -18,8 +18,8 @@ from .._manifold import AbstractLieGroup
 from .._system import LagrangianSystem, parameter as parameter, State
 
 
-# The Gauss-Legendre rule of one panel. It is exact to round-off if the panel is shorter
-# than its distance from the nearest complex singularity of the integrand.
+# The Gauss-Legendre rule of one panel. The rule is exact to round-off if the panel is
+# shorter than the distance to the nearest complex singularity of the integrand.
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(20)
 
 
@@ -94,8 +94,8 @@ def given_forces(
 ) -> Array:
     """Return the forces in `args` as an array, which is zero if `args` is None.
 
-    Raise a `ShapeError` unless they have the given shape. `what` describes them in
-    messages.
+    Raise a `ShapeError` unless the forces have the given shape. `what` describes the
+    forces in messages.
     """
     if args is None:
         return jnp.zeros(shape, dtype)
@@ -123,7 +123,7 @@ def integral(
     """Integrate a function of time over [0, t] to round-off.
 
     `integrand` maps an array of times to values whose last axes are the axes of this
-    array; `rate` is the inverse of the shortest time scale on which they vary.
+    array; `rate` is the inverse of the shortest time scale on which the values vary.
     """
     panels = math.ceil(abs(t) * rate) + 1
     edges = np.linspace(0.0, t, panels + 1)
@@ -153,7 +153,7 @@ class AbstractExample(eqx.Module):
     @property
     @abc.abstractmethod
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
 
     def energy(self, t: FloatScalarLike, q: Any, v: Array) -> Array:
         """Compute the energy D2L · v - L at one point (q, v)."""
@@ -165,8 +165,8 @@ class AbstractExample(eqx.Module):
     ) -> State:
         """Create the consistent state at (`q0`, `v0`).
 
-        `dtype` defaults to JAX's default float. `args` are the `args` of the run: the
-        multiplier depends on the forces in them.
+        `dtype` defaults to JAX's default float. Pass the `args` of the run, because the
+        multiplier depends on the forces in `args`.
         """
         if dtype is None:
             dtype = jnp.result_type(float)
@@ -194,7 +194,7 @@ class AbstractConstrainedExample(AbstractNonholonomicExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         return LagrangianSystem(self.lagrangian, nonholonomic=self.constraint)
 
 
@@ -208,7 +208,7 @@ class AbstractConstrainedGroupExample(AbstractNonholonomicExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         return LagrangianSystem(
             self.lagrangian, nonholonomic=self.constraint, manifold=self.manifold
         )

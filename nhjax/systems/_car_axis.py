@@ -17,18 +17,18 @@ from ._base import (
 
 
 class CarAxis(AbstractExample):
-    """An axle on two springs over two wheels, the right one on a bumpy road.
+    """An axle on two springs over two wheels; the right wheel is on a bumpy road.
 
     L = ε²M/4 (|ṙ_l|² + |ṙ_r|²) - ½ (|r_l| - l₀)² - ½ (|r_r - b| - l₀)²
     - ε²Mg/2 (y_l + y_r),
 
     Φ = (b · r_l, |r_l - r_r|² - l²),  b(t) = (√(l² - y_b²), y_b),  y_b = r sin ωt,
 
-    with q = (x_l, y_l, x_r, y_r) [m]: the ends of the axle, each with half of the mass
-    of the chassis. The left wheel stays at the origin, the right one is at b. Both
-    constraints are holonomic. The first one depends on time, and keeps the left spring
-    perpendicular to the line of the wheels. Energies are scaled by ε², where 1/ε² is
-    the stiffness of the springs.
+    with q = (x_l, y_l, x_r, y_r) [m]: the positions r_l and r_r of the ends of the
+    axle, each with half of the mass of the chassis. The left wheel stays at the origin,
+    the right wheel is at b. Both constraints are holonomic. The first constraint
+    depends on time, and keeps the left spring perpendicular to the line through the
+    wheels. The stiffness of the springs is 1/ε², and L is multiplied by ε².
 
     **Parameters:** `mass` M [kg] of the chassis; `epsilon` ε, whose inverse square is
     the stiffness of the springs; `length` l of the axle, `rest_length` l₀ of the
@@ -81,8 +81,7 @@ class CarAxis(AbstractExample):
         """Create a level axle on springs at their rest length, as in the source.
 
         The axle moves sideways, with the velocity that the first constraint requires at
-        t = 0.
-        `parameters` are the parameters of the class.
+        t = 0. `parameters` are the parameters of the class.
         """
         axis = cls(**parameters)
         height, zero = axis.rest_length, jnp.zeros_like(axis.rest_length)
@@ -92,11 +91,11 @@ class CarAxis(AbstractExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         return LagrangianSystem(self.lagrangian, holonomic=self.holonomic)
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Compute the Lagrangian, kinetic less potential energy, scaled by ε²."""
+        """Compute the Lagrangian, kinetic minus potential energy, times ε²."""
         mass = 0.5 * self.epsilon**2 * self.mass
         left, right = q[:2], q[2:] - self._wheel(t, q)
         stretches = jnp.stack([left @ left, right @ right])
@@ -116,7 +115,7 @@ class CarAxis(AbstractExample):
         return {}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute the places of both wheels and both ends, of shape (2,)."""
+        """Compute the places of both wheels and both axle ends, of shape (2,)."""
         wheel = self._wheel(t, q)
         wheels = {"left_wheel": jnp.zeros_like(wheel), "right_wheel": wheel}
         return wheels | {"left_end": q[:2], "right_end": q[2:]}

@@ -28,14 +28,14 @@ class CarWithTrailers(AbstractNonholonomicExample):
 
     q = (x, y, θ₀, δ, θ₁ ... θₙ): the middle of the rear axle [m], the heading of the
     car, the steer angle of the front wheels relative to the car, and the headings of
-    the trailers [rad]. With the unit vector n(θ) to the left of a heading, the wheels
-    do not slip sideways:
+    the trailers [rad]. The wheels do not slip sideways. With the unit vectors e(θ)
+    along a heading θ and n(θ) to its left, the constraints are
 
     Φ = (n(θ₀)·ṙ₀, n(θ₀ + δ)·ṙ_front, n(θ₁)·ṙ₁ ... n(θₙ)·ṙₙ)
 
-    for the rear axle r₀ and the front axle r₀ + L e(θ₀) of the car and the axles
-    r_i = r_{i-1} - h_i e(θ_{i-1}) - d_i e(θ_i) of the trailers. The multipliers are the
-    forces of the ground on the axles, to the left of the wheels.
+    for the rear axle r₀ and the front axle r₀ + L e(θ₀) of the car with the wheelbase
+    L, and the axles r_i = r_{i-1} - h_i e(θ_{i-1}) - d_i e(θ_i) of the trailers. The
+    multipliers are the forces of the ground on the axles, to the left of the wheels.
 
     `args` is None or a pair of the force that drives the car at the rear axle [N] and
     the torque that steers the front wheels [N m]. Without the torque, the momentum
@@ -44,12 +44,13 @@ class CarWithTrailers(AbstractNonholonomicExample):
 
     **Parameters:** `num_trailers` n, static. For the car: `wheelbase` L, `centre` of
     mass ahead of the rear axle [m], `mass` [kg], `inertia` about the centre and
-    `steer_inertia` J of the front wheels about the vertical [kg m²]. For the trailers,
-    each one number for all or an array of n numbers: `trailer_length` d from hitch to
-    axle, `trailer_hitch` h, the distance of the hitch behind the axle of the vehicle in
-    front, `trailer_centre` of mass ahead of the axle [m], `trailer_mass` [kg] and
-    `trailer_inertia` about the centre [kg m²]. The default values do not describe a
-    particular car. The default `v0` is consistent at `q0`, with a speed of 5 m/s.
+    `steer_inertia` J of the front wheels about the vertical [kg m²]. For the trailers:
+    `trailer_length` d from hitch to axle, `trailer_hitch` h, the distance of the hitch
+    behind the axle of the vehicle in front, `trailer_centre` of mass ahead of the axle
+    [m], `trailer_mass` [kg] and `trailer_inertia` about the centre [kg m²]. Each of
+    them is one number for all trailers, or an array of n numbers. The default values do
+    not describe a particular car. The default `v0` is consistent at `q0`, with a speed
+    of 5 m/s.
 
     **Source:** Laumond, *Controllability of a multibody mobile robot* (1993), and
     Rouchon, Fliess, Lévine and Martin, *Flatness and motion planning: the car with n
@@ -141,7 +142,7 @@ class CarWithTrailers(AbstractNonholonomicExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         return LagrangianSystem(
             self.lagrangian, nonholonomic=self.constraint, force=self.force
         )
@@ -149,7 +150,7 @@ class CarWithTrailers(AbstractNonholonomicExample):
     def velocity(
         self, q: Array, speed: ArrayLike, steer_rate: ArrayLike = 0.0
     ) -> Array:
-        """Compute the v that satisfies the constraints from the speed of the rear axle.
+        """Compute the v that satisfies the constraints, given the rear axle's speed.
 
         A trailer turns at the rate (v sin β - h θ̇ cos β)/d and has the speed
         v cos β + h θ̇ sin β, where v and θ̇ are the speed and the turning rate of the
@@ -199,7 +200,7 @@ class CarWithTrailers(AbstractNonholonomicExample):
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
         """Compute the energy and the momentum of the front wheels, J (θ̇₀ + δ̇).
 
-        They are conserved without driving force and torque.
+        Both are conserved without driving force and torque.
         """
         return {
             "energy": self.energy(t, q, v),
@@ -218,7 +219,7 @@ class CarWithTrailers(AbstractNonholonomicExample):
 
 
 def _axles(car: CarWithTrailers, q: Array) -> list[Float[Array, "2"]]:
-    """Compute the axles: rear and front of the car, and one of each trailer."""
+    """Compute the positions of the car's two axles and of each trailer's axle."""
     axle, along = q[:2], direction(q[2])
     axles = [axle, axle + car.wheelbase * along]
     for i, (length, hitch) in enumerate(_hitches(car, q.dtype)):
@@ -238,7 +239,7 @@ def _centres(car: CarWithTrailers, q: Array) -> list[Float[Array, "2"]]:
 
 
 def _hitches(car: CarWithTrailers, dtype: DTypeLike) -> list[tuple[Array, Array]]:
-    """Return the length of each trailer and the distance of its hitch."""
+    """Return `trailer_length` and `trailer_hitch` of each trailer."""
     lengths, hitches = (
         _of_trailers(car, name, dtype) for name in ("trailer_length", "trailer_hitch")
     )

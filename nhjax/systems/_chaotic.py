@@ -19,8 +19,8 @@ class ChaoticSystem(AbstractConstrainedExample):
     L = ½ |v|² - ½ (|q|² + q²_{m+2} q²_{m+3} + Σ_{i=1..m} q²_{1+i} q²_{m+1+i}),
     Φ = v_1 + Σ_{i=m+2..n} q_i v_i, in dimensionless units.
 
-    **Parameters:** `m`, static: it sets the number of coordinates. The defaults of
-    `q0` and `v0` are the middle member, j/J = ½, of `ensemble`.
+    **Parameters:** `m`, static, which sets the number of coordinates. The defaults of
+    `q0` and `v0` are the data of the middle row of `ensemble`, j = J/2.
 
     **Source:** McLachlan and Perlmutter (2006) and Jay (2009), as in Martín de Diego
     and Sato Martín de Almagro, *High-order geometric methods for nonholonomic
@@ -81,8 +81,9 @@ class ChaoticSystem(AbstractConstrainedExample):
         """Create initial data (q0, v0) of shape (J + 1, n), all with the same energy.
 
         `members` is the paper's J: row j = 0..J has q_1 = cos(jπ/2J) and
-        v_2 = sin(jπ/2J). For m = 3 these are the paper's data, of energy 3.06. Other
-        m have the same pattern: q_2..q_{m+1} = m/5..1/5 and q_{m+2}..q_n = 1.
+        v_2 = sin(jπ/2J). All rows have q_2..q_{m+1} = m/5..1/5, q_{m+2}..q_n = 1, and
+        zero for the other velocities. For m = 3 these are the paper's data, with the
+        energy 3.06.
         """
         if members < 1:
             raise ValueError(f"`members` must be at least 1, got {members}.")

@@ -11,7 +11,7 @@ from ._rolling_body import AbstractRollingBody
 
 
 class ChaplyginSphere(AbstractRollingBody):
-    """A balanced sphere with three moments of inertia that rolls on a plane.
+    """A balanced sphere with three different moments of inertia that rolls on a plane.
 
     ℓ = m/2 |v|² + ½ (I₁ω₁² + I₂ω₂² + I₃ω₃²) - m g z,  Φ = z - r,
     φ = (R (v - r ω × γ))₁₂,  γ = Rᵀ e₃,
@@ -81,7 +81,7 @@ class ChaplyginSphere(AbstractRollingBody):
         return -self.radius * up
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Compute the conserved quantities: the energy, and R K in space."""
+        """Compute the energy and R K, the contact momentum in space: both conserved."""
         x, y, z = SO3().Ad(q[:4], self.contact_momentum(q, v))
         return {
             "energy": self.energy(t, q, v),

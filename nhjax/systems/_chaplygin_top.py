@@ -28,9 +28,9 @@ class ChaplyginTop(AbstractRollingBody):
     contact is s, seen from the centre of mass; Φ is its height, and φ the horizontal
     velocity there. The multipliers are the force of the plane in space [N].
 
-    If I₁ = I₂, the body is Routh's sphere, which is integrable: besides the energy it
-    conserves Jellett's integral K·s, with the angular momentum K about the contact, and
-    Routh's integral ω₃ √(I₁I₃ + m (I₁ (s₁² + s₂²) + I₃ s₃²)).
+    If I₁ = I₂, the body is Routh's sphere, which is integrable. Besides the energy, two
+    quantities are then conserved: Jellett's integral K·s, with the angular momentum K
+    about the contact, and Routh's integral ω₃ √(I₁I₃ + m (I₁ (s₁² + s₂²) + I₃ s₃²)).
 
     **Parameters:** `mass` m [kg]; `radius` r [m]; `offset` a [m], of either sign;
     `moments` (I₁, I₂, I₃) about the centre of mass [kg m²]; `gravity` g [m/s²];
@@ -96,7 +96,7 @@ class ChaplyginTop(AbstractRollingBody):
         return (-self.radius * up).at[2].add(self.offset)
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Compute the conserved quantities: the energy, for any moments."""
+        """Compute the energy, which is conserved for all moments of inertia."""
         return {"energy": self.energy(t, q, v)}
 
     def integrals_of_routh(self, q: Array, v: Array) -> tuple[Array, Array]:

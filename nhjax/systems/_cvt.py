@@ -21,9 +21,10 @@ class ContinuouslyVariableTransmission(AbstractConstrainedExample):
     energies E_d = ½ ẏ² - cos y + ½ ε sin 2y and E_p = ½ (ẋ² + ż² + x² + z²) are
     conserved separately.
 
-    **Parameters:** `epsilon` ε >= 0, the perturbation of the pendulum [1]. `low` and
-    `high` give the two sets of initial data: an oscillating driver (E_d = 4/5,
-    E_p = 1; the default) and a rotating one (E_d = 3, E_p = 1).
+    **Parameters:** `epsilon` ε >= 0, the perturbation of the pendulum [1]. The class
+    methods `low` and `high` create the system with the two sets of initial data of the
+    paper: an oscillating driver (E_d = 4/5, E_p = 1; the default) and a rotating driver
+    (E_d = 3, E_p = 1).
 
     **Source:** Modin and Verdier; Martín de Diego and Sato Martín de Almagro,
     *High-order geometric methods for nonholonomic mechanical systems*, second
@@ -85,8 +86,8 @@ class ContinuouslyVariableTransmission(AbstractConstrainedExample):
     def exact_driver(self, t: float) -> tuple[float, float]:
         """Compute (y, ẏ) at `t` for ε = 0, except at the upright equilibrium.
 
-        With k² = (1 + E_d)/2, sin(y/2) = k sn(t + t0 | k²) if the pendulum oscillates
-        (k < 1), and y/2 = ±am(k(t + t0) | 1/k²) if it rotates.
+        Let k² = (1 + E_d)/2. If the pendulum oscillates (k < 1), the solution is
+        sin(y/2) = k sn(t + t0 | k²); if it rotates, y/2 = ±am(k(t + t0) | 1/k²).
         """
         if float(self.epsilon) != 0:
             raise ValueError(

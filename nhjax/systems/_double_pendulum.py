@@ -21,7 +21,7 @@ class DoublePendulum(AbstractExample):
     L = m₁/2 |ṙ₁|² + m₂/2 |ṙ₂|² - m₁ g y₁ - m₂ g y₂,
     Φ = (|r₁|² - l₁², |r₂ - r₁|² - l₂²),  q = (x₁, y₁, x₂, y₂), y upwards.
 
-    Its motion is chaotic at large angles.
+    At large angles the motion is chaotic.
 
     **Parameters:** `masses` (m₁, m₂) [kg], `lengths` (l₁, l₂) [m], `gravity` g [m/s²].
 
@@ -72,7 +72,7 @@ class DoublePendulum(AbstractExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         return LagrangianSystem(self.lagrangian, holonomic=self.holonomic)
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:

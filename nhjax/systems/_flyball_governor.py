@@ -29,9 +29,9 @@ class FlyballGovernor(AbstractExample):
 
     with q = (φ, β₁, β₂, s): the angle of the shaft and the angles of the rods below the
     horizontal [rad], and the height of the slider [m], which turns with the shaft. Each
-    rod has the direction u_k = ± cos β_k e(φ) - sin β_k e_z, and its hinge is at the
-    radius a and the height h. Seen from the hinge, the centre of the rod is c_k = ½ l
-    u_k, and its ball is b_k = l u_k.
+    rod has the direction u_k = ± cos β_k e(φ) - sin β_k e_z, with the horizontal unit
+    vector e(φ), and its hinge p_k is at the radius a and the height h. The centre of
+    the rod is c_k = p_k + ½ l u_k, and its ball is b_k = p_k + l u_k.
 
     A coupler of length d ties the middle of each rod to the slider at the radius a; d_k
     is the distance between its ends. The couplers are either rigid rods
@@ -110,10 +110,10 @@ class FlyballGovernor(AbstractExample):
         angle_rate: ArrayLike = 0.0,
         **parameters: Any,
     ) -> "FlyballGovernor":
-        """Create a governor with both rods at `angle`, the shaft turning at `rate`.
+        """Create a governor with both rods at `angle` and a shaft that turns at `rate`.
 
-        The slider hangs below the middles of the rods, at the length of the couplers.
-        `parameters` are the parameters of the class.
+        The slider is below the middles of the rods, where both couplers have the length
+        d. `parameters` are the parameters of the class.
         """
         governor = cls(**parameters)
         dtype = governor.q0.dtype
@@ -137,7 +137,7 @@ class FlyballGovernor(AbstractExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         rigid = self.couplers == "rods"
         return LagrangianSystem(
             self.lagrangian,
@@ -204,7 +204,7 @@ class FlyballGovernor(AbstractExample):
         }
 
     def _rods(self, q: Array) -> tuple[Float[Array, "2 3"], Float[Array, "2 3"]]:
-        """Compute the hinges, and the unit vectors u_k along the rods from there."""
+        """Compute the hinges p_k, and the unit vectors u_k from hinges along rods."""
         outward = jnp.stack([jnp.cos(q[0]), jnp.sin(q[0])])
         radial = jnp.stack([outward, -outward])
         cos, sin = jnp.cos(q[1:3])[:, None], jnp.sin(q[1:3])[:, None]

@@ -29,11 +29,13 @@ class FourBar(AbstractExample):
 
     with q = (θ₁, θ₂, θ₃), the angles of crank, coupler and rocker from the horizontal
     [rad], and e(θ) = (cos θ, sin θ). The crank turns about the origin, the rocker about
-    (l₄, 0). The bars are uniform, I = m l²/12 about their centres c. The default is a
-    crank-rocker, whose crank makes full turns, with bars of 1 kg/m.
+    (l₄, 0). Each bar is uniform, with the moment of inertia I = m l²/12 about its
+    centre c, which is at the height y. The default is a crank-rocker, whose crank makes
+    full turns, with bars of 1 kg/m.
 
-    **Parameters:** `lengths` (l₁, l₂, l₃, l₄) [m], the last for the ground; `masses`
-    (m₁, m₂, m₃) [kg]; `gravity` g [m/s²]; `torque` M on the crank [N m].
+    **Parameters:** `lengths` (l₁, l₂, l₃, l₄) [m], where l₄ is the distance of the two
+    fixed joints; `masses` (m₁, m₂, m₃) [kg]; `gravity` g [m/s²]; `torque` M on the
+    crank [N m].
 
     **Source:** García de Jalón and Bayo, *Kinematic and Dynamic Simulation of Multibody
     Systems* (1994); for `parallelogram`, the problem "N four-bar mechanism" of
@@ -67,7 +69,7 @@ class FourBar(AbstractExample):
 
     @classmethod
     def turning(cls, angle: ArrayLike, rate: ArrayLike, **parameters: Any) -> "FourBar":
-        """Create a linkage with the crank at `angle` and `rate`.
+        """Create a linkage with the crank at `angle`, which turns at `rate`.
 
         The coupler is on the left of the line from the crank's end to (l₄, 0).
         `parameters` are the parameters of the class.
@@ -94,17 +96,18 @@ class FourBar(AbstractExample):
 
     @classmethod
     def parallelogram(cls) -> "FourBar":
-        """Create the benchmark of one loop: bars of 1 m, 1 kg, falling to the right.
+        """Create the benchmark with one loop, whose bars have 1 m and 1 kg.
 
-        The crank is upright, and its end moves at 1 m/s. When all bars are horizontal,
-        first after 0.71 s, the constraints are dependent, and the loop may fold.
+        At the start the crank is upright, and its end moves to the right at 1 m/s. When
+        all bars are horizontal, first after 0.71 s, the constraints are dependent, and
+        the loop may fold.
         """
         q0, v0 = (0.5 * math.pi, 0.0, 0.5 * math.pi), (-1.0, 0.0, -1.0)
         return cls((1.0,) * 4, (1.0,) * 3, q0=q0, v0=v0)
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         return LagrangianSystem(
             self.lagrangian, holonomic=self.holonomic, force=self.force
         )
@@ -127,7 +130,7 @@ class FourBar(AbstractExample):
         return jnp.zeros_like(v).at[0].set(self.torque.astype(v.dtype))
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Compute the energy minus the work M θ₁ of the torque, which is conserved."""
+        """Compute the conserved difference of the energy and the torque's work M θ₁."""
         return {"energy_less_work": self.energy(t, q, v) - self.torque * q[0]}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:

@@ -9,14 +9,14 @@ from jaxtyping import Array, Float
 class Frame(NamedTuple):
     """A rigid motion: a point c of the body is at origin + rotation c in space.
 
-    The rate of a motion has the same two parts.
+    The rate of a motion is a `Frame` too, with the time derivatives of both parts.
     """
 
     rotation: Float[Array, "3 3"]
     origin: Float[Array, "3"]
 
     def move(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Compute the position of a point of the body, or for a rate its velocity."""
+        """Compute the place of a point of the body, or its velocity from a rate."""
         return self.origin + self.rotation @ point
 
 
@@ -25,17 +25,18 @@ def angular_velocity(
 ) -> Float[Array, "3"]:
     """Compute the angular velocity of a wheel on a moving frame, in the frame's axes.
 
-    The wheel turns at the rate `spin` about the second axis of the frame. With the rate
-    zero, this is the angular velocity of the frame itself.
+    The wheel turns at the rate `spin` about the second axis of the frame. With a zero
+    `spin`, the result is the angular velocity of the frame itself.
     """
     skew = frame.rotation.T @ rate.rotation
     return jnp.stack([skew[2, 1], skew[0, 2] + spin, skew[1, 0]])
 
 
 def down(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """Compute the direction from the hub of a wheel to its point with largest z.
+    """Compute the direction from the hub of a wheel to its lowest point.
 
-    The axle of the wheel is the second axis of the frame with `rotation`.
+    The z axis points down, so that this point has the largest z. The axle of the wheel
+    is the second axis of the frame with `rotation`.
     """
     axle = rotation[:, 1]
     below = jnp.asarray([0, 0, 1], axle.dtype) - axle[2] * axle
@@ -45,7 +46,7 @@ def down(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
 def contact_point(
     hub: Float[Array, "3"], radius: Float[Array, ""], frame: Frame
 ) -> Float[Array, "3"]:
-    """Compute the point with largest z of a wheel on a frame."""
+    """Compute the lowest point, with the largest z, of a wheel on a frame."""
     return frame.move(hub) + radius * down(frame.rotation)
 
 

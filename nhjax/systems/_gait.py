@@ -14,7 +14,7 @@ from ._base import AbstractNonholonomicExample, coordinates
 
 
 class Sinusoid(eqx.Module):
-    """Joint angles a sin(ωt + β), one or an array of them, as a function of time."""
+    """One joint angle, or an array of angles, a sin(ωt + β) as a function of time."""
 
     amplitude: Array = eqx.field(converter=coordinates)
     rate: Array = eqx.field(converter=coordinates)
@@ -48,7 +48,7 @@ class AbstractGaitMachine(AbstractNonholonomicExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         if self.gait is None:
             return LagrangianSystem(
                 self.lagrangian, nonholonomic=self.constraint, force=self.force

@@ -21,9 +21,9 @@ class HeavyTop(AbstractExample):
 
     ℓ = m/2 |ω × X|² + ½ (J₁ω₁² + J₂ω₂² + J₃ω₃²) - m g e₃·(R X),
 
-    with q the attitude R, a quaternion, ω the body angular velocity along the principal
-    axes, and X the centre of mass in the body, seen from the pivot. If J₁ = J₂ and X
-    lies on the third axis, as by default, the body is Lagrange's top.
+    with the attitude quaternion q of the rotation R, the body angular velocity ω along
+    the principal axes, and the centre of mass X in the body, seen from the pivot. If
+    J₁ = J₂ and X lies on the third axis, as by default, the body is Lagrange's top.
 
     **Parameters:** `mass` m [kg], `moments` (J₁, J₂, J₃) about the centre of mass
     [kg m²], `centre` X [m], `gravity` g [m/s²]; `retraction`, the retraction of SO(3).
@@ -60,7 +60,7 @@ class HeavyTop(AbstractExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         return LagrangianSystem(self.lagrangian, manifold=self.manifold)
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
@@ -114,8 +114,9 @@ class HeavyTopSE3(AbstractExample):
 
     with q = (R, x): the attitude quaternion and the position of the centre of mass;
     (v, ω) are their body velocities, and X is the centre of mass in the body, seen from
-    the pivot. The three constraints are holonomic, and their multiplier is the force of
-    the pivot in space. The body moves like `HeavyTop` with the same parameters.
+    the pivot. The three constraints are holonomic, and their multipliers are the
+    components of the force of the pivot in space. The body moves like `HeavyTop` with
+    the same parameters.
 
     **Parameters:** the parameters of `HeavyTop`; `retraction`, the retraction of SE(3).
 
@@ -155,7 +156,7 @@ class HeavyTopSE3(AbstractExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         return LagrangianSystem(
             self.lagrangian, holonomic=self.holonomic, manifold=self.manifold
         )

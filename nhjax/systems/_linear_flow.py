@@ -84,7 +84,7 @@ def rotation(quaternion: np.ndarray) -> np.ndarray:
 
 
 def _product_matrix(omega: np.ndarray, side: float) -> np.ndarray:
-    """Create the matrix of the product with (0, ω).
+    """Create the matrix that multiplies a quaternion by (0, ω).
 
     The factor (0, ω) is on the right if `side` is 1, and on the left if it is -1.
     """

@@ -25,9 +25,9 @@ class PendulumChain(AbstractExample):
     with q = (x₁, y₁, ..., x_n, y_n) [m], y upwards, and the pivot r₀ = 0. There are n
     holonomic constraints on 2n coordinates. A chain with many links is a discrete rope.
 
-    **Parameters:** `num_links` n, static; `masses` m_k [kg] and `lengths` l_k [m], one
-    for all or of shape (n,); `gravity` g [m/s²]. By default all rods lie on one line,
-    at half a radian from the vertical and at rest.
+    **Parameters:** `num_links` n, static; `masses` m_k [kg] and `lengths` l_k [m], each
+    one number for all links or an array of shape (n,); `gravity` g [m/s²]. By default
+    all rods lie on one line, at half a radian from the vertical and at rest.
 
     **Source:** Daniel Bernoulli (1738); Hairer, Lubich and Wanner, *Geometric Numerical
     Integration*, section VII.1, for the formulation. With two links the chain is
@@ -98,7 +98,7 @@ class PendulumChain(AbstractExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         return LagrangianSystem(self.lagrangian, holonomic=self.holonomic)
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:

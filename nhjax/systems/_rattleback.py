@@ -28,11 +28,11 @@ class Rattleback(AbstractRollingBody):
 
     with q = (R, x): the attitude quaternion and the position of the centre of mass
     [m]; (v, ω) are their body velocities [m/s, 1/s]. The body axes are the axes of the
-    ellipsoid, the third one upward at rest, and s is the lowest point, seen from the
-    centre of mass. Φ is its height, and φ the horizontal velocity at the contact; their
-    multipliers are the force of the plane in space [N]. The third axis is a principal
-    axis of inertia; the others are not, so that a spin in one sense turns into rocking,
-    and rocking into a spin in the other sense.
+    ellipsoid; at rest, the third axis points upward. The lowest point is s, seen from
+    the centre of mass. Φ is its height, and φ the horizontal velocity at the contact;
+    their multipliers are the force of the plane in space [N]. The third axis is a
+    principal axis of inertia, but the other two axes are not. Therefore a spin in one
+    sense turns into rocking, and the rocking into a spin in the other sense.
 
     With `damping` σ the air exerts the torque -σω, and energy is not conserved.
 
@@ -43,8 +43,8 @@ class Rattleback(AbstractRollingBody):
 
     **Source:** Kane and Levinson, *Realistic mathematical modeling of the rattleback*,
     International Journal of Non-Linear Mechanics 17 (1982), whose parameters are the
-    default. Their third axis is downward, so that their product D is -J₁₂; their σ is
-    1e-4.
+    default. Kane and Levinson's third axis points downward, so that their product D is
+    -J₁₂. Their σ is 1e-4.
 
     !!! example
 
@@ -131,7 +131,7 @@ class Rattleback(AbstractRollingBody):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         return LagrangianSystem(
             self.lagrangian,
             nonholonomic=self.constraint,

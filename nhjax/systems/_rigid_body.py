@@ -24,8 +24,8 @@ from ._linear_flow import attitude
 class FreeRigidBody(AbstractExample):
     """A rigid body that turns freely about its centre of mass, on SO(3), unconstrained.
 
-    ℓ = ½ (I₁ω₁² + I₂ω₂² + I₃ω₃²), with q the attitude, a quaternion, and ω the body
-    angular velocity along the principal axes.
+    ℓ = ½ (I₁ω₁² + I₂ω₂² + I₃ω₃²), with the attitude quaternion q and the body angular
+    velocity ω along the principal axes.
 
     **Parameters:** `moments` (I₁, I₂, I₃), the principal moments of inertia [kg m²];
     `retraction`, the retraction of SO(3).
@@ -59,7 +59,7 @@ class FreeRigidBody(AbstractExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         return LagrangianSystem(self.lagrangian, manifold=self.manifold)
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
@@ -98,7 +98,9 @@ class FreeRigidBody(AbstractExample):
 def _euler_solution(
     moments: np.ndarray, omega0: np.ndarray
 ) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
-    """Find the solution ω(t) of Euler's equations, and a bound on its rate and size.
+    """Find the solution ω(t) of Euler's equations, and its `rate` for `attitude`.
+
+    This rate is a bound on |ω| and on the inverse of the time scale of ω.
 
     Let 2 be the principal axis with the middle moment, and 3 the principal axis around
     which ω moves in the body; axis 3 has the largest or the smallest moment. Then ω₁,

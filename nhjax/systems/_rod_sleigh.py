@@ -1,4 +1,4 @@
-"""A sleigh of two point masses on a rod, with both kinds of constraints."""
+"""A sleigh of two point masses, with a nonholonomic and a holonomic constraint."""
 
 import math
 
@@ -29,16 +29,18 @@ class RodSleigh(AbstractNonholonomicExample):
     with the nonholonomic constraint Φ = n·ṙ₁ and the holonomic constraint
     Φ_hol = |r₂ - r₁|² - l².
     The blade makes the angle β with the rod; its normal n is (r₂ - r₁)/l turned by
-    β + π/2. For β = 0 this is the `ChaplyginSleigh`. For other angles n is not
+    β + π/2. For β = 0 the system is the `ChaplyginSleigh`. For other angles n is not
     orthogonal to the rod, so that the reactions of the two constraints are coupled.
 
-    The body moves as if the blade stood where the perpendicular from the centre of mass
-    meets the line through the blade's contact along n: both positions of the blade
-    permit the same velocities.
+    A blade with the same direction at another point of the line through the contact
+    along n permits the same velocities of the body. Therefore the body moves like a
+    `ChaplyginSleigh` whose blade is at the foot of the perpendicular from the centre of
+    mass to this line.
 
     **Parameters:** `mass1` m₁ and `mass2` m₂ [kg], `length` l [m], `angle` β [rad].
 
-    **Source:** Chaplygin (1911), for β = 0; a test of both kinds of constraints.
+    **Source:** Chaplygin (1911), for β = 0. Other angles serve to test systems with
+    both kinds of constraints.
 
     !!! example
 
@@ -85,7 +87,7 @@ class RodSleigh(AbstractNonholonomicExample):
     ) -> "RodSleigh":
         """Create a sleigh that slides along its blade with `speed` while it turns.
 
-        `position` is the position of the blade, `rod` the direction of the rod.
+        `position` is the position of the blade, and `rod` is the angle of the rod.
         """
         length, rod_angle = parameter(length), parameter(rod)
         heading = rod_angle + parameter(angle)
@@ -104,7 +106,7 @@ class RodSleigh(AbstractNonholonomicExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         return LagrangianSystem(
             self.lagrangian, nonholonomic=self.constraint, holonomic=self.holonomic
         )
@@ -134,8 +136,8 @@ class RodSleigh(AbstractNonholonomicExample):
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute (q, v, λ) at `t`, for consistent data, a turning rod and cos β != 0.
 
-        λ is (nonholonomic, holonomic). The motion is computed from the motion of
-        `equivalent_sleigh`.
+        λ has the nonholonomic multiplier first, then the holonomic multiplier. Both,
+        and the motion, are computed from the exact solution of `equivalent_sleigh`.
         """
         self._consistent_data()
         tangency = jax.jvp(
@@ -159,7 +161,7 @@ class RodSleigh(AbstractNonholonomicExample):
         first = np.array([x, y]) - shift * normal
         slide = np.array([dx, dy]) + shift * omega * along
         second_slide = slide + omega * np.array([-rod[1], rod[0]])
-        # The second mass is moved by the rod alone.
+        # Only the rod exerts a force on the second mass.
         tension = blade_force * math.sin(beta) / length + m1 * omega**2
         return (
             np.concatenate([first, first + rod]),
@@ -168,7 +170,7 @@ class RodSleigh(AbstractNonholonomicExample):
         )
 
     def equivalent_sleigh(self) -> ChaplyginSleigh:
-        """Create a Chaplygin sleigh with this motion; its contact is moved along n."""
+        """Create a sleigh with the same motion, whose contact is moved along n."""
         rod, swing = self.q0[2:] - self.q0[:2], self.v0[2:] - self.v0[:2]
         heading = jnp.arctan2(rod[1], rod[0]) + self.angle
         turn_rate = (rod[0] * swing[1] - rod[1] * swing[0]) / self.length**2

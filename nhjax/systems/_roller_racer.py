@@ -22,7 +22,7 @@ from ._planar import direction, kinetic_energy
 
 
 class RollerRacer(AbstractGaitMachine):
-    """Two bodies with one axle each, and a pivot that the rider swings.
+    """Two bodies with one axle each, joined by a pivot that the rider swings.
 
     L = m₁/2 |ṙ₁|² + I₁/2 θ̇² + m₂/2 |ṙ₂|² + I₂/2 (θ̇ + φ̇)²,
     Φ = (n₁ · ṙ₁, n₂ · ṙ₂),  r₂ = r₁ + d₁ e(θ) + d₂ e(θ + φ),
@@ -33,9 +33,9 @@ class RollerRacer(AbstractGaitMachine):
     lie at the axles, d₁ behind and d₂ ahead of the pivot. Where d₁ cos φ + d₂ = 0 the
     constraints do not determine the turning rate.
 
-    The pivot is either prescribed by a `gait`, Γ = φ - gait(t), or with `gait=None` it
-    moves freely under the torque [N m] in `args`, a scalar or `None`. The default gait
-    is a sine, which accelerates the seat from rest.
+    A `gait` prescribes φ by the holonomic constraint Γ = φ - gait(t). With `gait=None`
+    the pivot moves freely under the torque [N m] in `args`, a scalar or `None`. The
+    default gait is a sine, which accelerates the seat from rest.
 
     **Parameters:** `masses` (m₁, m₂) [kg], `inertias` (I₁, I₂) [kg m²], `distances`
     (d₁, d₂) [m]; `gait`, a function of time. The mass of the handlebar may be 0.
@@ -79,9 +79,9 @@ class RollerRacer(AbstractGaitMachine):
         angle_rate: ArrayLike = 0.0,
         **parameters: Any,
     ) -> "RollerRacer":
-        """Create a racer with the seat at the origin, moving ahead at `speed`, θ = 0.
+        """Create a racer at the origin with θ = 0, whose seat moves ahead at `speed`.
 
-        Its turning rate follows from the constraints. `parameters` are the parameters
+        The turning rate follows from the constraints. `parameters` are the parameters
         of the class; without a `gait` among them the pivot moves freely.
         """
         merged: dict[str, Any] = {"gait": None} | parameters

@@ -28,15 +28,15 @@ class AbstractRollingBody(AbstractConstrainedGroupExample):
     with q = (R, x): the attitude quaternion and the position of the centre of mass
     [m]; (v, ω) are their body velocities [m/s, 1/s]. The lowest point of the body is s,
     seen from the centre of mass in body axes: Φ is its height, and φ the horizontal
-    velocity of the material point that is there. The multipliers are the force of the
-    plane in space: its horizontal components, and the normal one [N].
+    velocity of the material point at s. The multipliers are the force of the plane in
+    space: its two horizontal components, and its normal component [N].
     """
 
     mass: eqx.AbstractVar[Array]
     retraction: eqx.AbstractVar[AbstractRetraction]
 
-    # This is a property, because an abstract field `gravity` would become the second
-    # argument of all bodies.
+    # The weight is a property, because an abstract field `gravity` would become the
+    # second argument of all bodies.
     @property
     @abc.abstractmethod
     def weight(self) -> Array:
@@ -49,7 +49,7 @@ class AbstractRollingBody(AbstractConstrainedGroupExample):
 
     @abc.abstractmethod
     def lowest_point(self, up: Vector3) -> Vector3:
-        """Compute s, from the centre of mass to the lowest point, in body axes.
+        """Compute s, the vector from centre of mass to lowest point, in body axes.
 
         `up` is the upward vertical in body axes.
         """
@@ -61,7 +61,7 @@ class AbstractRollingBody(AbstractConstrainedGroupExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         return LagrangianSystem(
             self.lagrangian,
             nonholonomic=self.constraint,
@@ -91,8 +91,8 @@ class AbstractRollingBody(AbstractConstrainedGroupExample):
     def plane_symmetry(self, q: Pose) -> Float[Array, "3 6"]:
         """Compute the generators of the motions of the plane, as body velocities.
 
-        They are the translations along x and y and the rotation about z. The system has
-        these symmetries for every shape of the body.
+        The motions are the translations along x and y and the rotation about z. They
+        are symmetries of the system for every shape of the body.
         """
         motions = jnp.eye(6, dtype=q.dtype)[jnp.array([0, 1, 5])]
         back = self.manifold.inverse(q)

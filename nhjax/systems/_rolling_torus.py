@@ -1,4 +1,4 @@
-"""The rolling torus, and with a tube of radius zero the rolling disc of Euler."""
+"""The rolling torus; if its tube has the radius zero, it is Euler's rolling disc."""
 
 from typing import Any
 
@@ -31,8 +31,9 @@ class RollingTorus(AbstractRollingBody):
     With r = 0, the default, the body is a disc of zero thickness: Euler's disc without
     slip.
 
-    The axle must not be vertical. In a steady motion the centre moves on a circle, or
-    rests, at a constant tilt; `steady` and `circling` create such motions.
+    The axle must not be vertical, because the lowest point is not unique then. In a
+    steady motion the tilt is constant, and the centre moves on a circle or rests;
+    `steady` and `circling` create steady motions.
 
     **Parameters:** `mass` m [kg]; `radius` a of the circle in the middle of the tube,
     and `tube_radius` r [m]; `diametral_inertia` I and `axial_inertia` J about the
@@ -157,8 +158,8 @@ class RollingTorus(AbstractRollingBody):
     def symmetry(self, q: Array) -> Float[Array, "4 6"]:
         """Compute the generators of all symmetries, as body velocities.
 
-        They are the symmetries of the plane, and the rotation of the torus about its
-        axle.
+        The symmetries are the motions of the plane, and the rotation of the torus about
+        its axle.
         """
         spin = jnp.zeros((1, 6), q.dtype).at[0, 5].set(1)
         return jnp.concatenate([self.plane_symmetry(q), spin])

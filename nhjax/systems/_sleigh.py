@@ -24,9 +24,10 @@ class ChaplyginSleigh(AbstractConstrainedExample):
     L = m/2 [(ẋ - aθ̇ sin θ)² + (ẏ + aθ̇ cos θ)²] + J/2 θ̇²,
     Φ = -sin θ ẋ + cos θ ẏ,  q = (x, y, θ),
 
-    with (x, y) the contact of the blade, so that the mass matrix depends on θ. With
-    u the speed along the blade and I = J + ma², u̇ = aθ̇² and Iθ̈ = -mauθ̇: every
-    motion tends to a straight motion with the centre of mass in front.
+    with (x, y) the contact of the blade, so that the mass matrix depends on θ. With the
+    speed u along the blade and I = J + ma², the equations of motion are u̇ = aθ̇² and
+    Iθ̈ = -mauθ̇. Therefore every motion tends to a straight motion with the centre of
+    mass in front.
 
     **Parameters:** `mass` m [kg], `inertia` J about the centre of mass [kg m²],
     `offset` a of the centre of mass ahead of the blade [m].

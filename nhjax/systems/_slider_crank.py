@@ -27,7 +27,7 @@ class SliderCrank(AbstractExample):
 
     with q = (θ, φ, x): the angles of the crank and of the rod from the horizontal
     [rad], and the place of the slider [m], which runs along y = e. Crank and rod are
-    uniform bars, I = m l²/12 about their centres c.
+    uniform bars: a bar of length l has I = m l²/12 about its centre c, at the height y.
 
     **Parameters:** `crank_length` r, `rod_length` l, `offset` e [m]; `crank_mass`,
     `rod_mass`, `slider_mass` m_s [kg]; `gravity` g [m/s²]; `torque` M on the crank
@@ -72,9 +72,10 @@ class SliderCrank(AbstractExample):
     def turning(
         cls, angle: ArrayLike, rate: ArrayLike, **parameters: Any
     ) -> "SliderCrank":
-        """Create a mechanism with the crank at `angle` and `rate`, the slider ahead.
+        """Create a mechanism with the crank at `angle`, which turns at `rate`.
 
-        `parameters` are the parameters of the class.
+        The slider is at a larger x than the pin of the crank. `parameters` are the
+        parameters of the class.
         """
         engine = cls(**parameters)
         theta, dtheta = parameter(angle), parameter(rate)
@@ -92,7 +93,7 @@ class SliderCrank(AbstractExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         return LagrangianSystem(
             self.lagrangian, holonomic=self.holonomic, force=self.force
         )
@@ -115,7 +116,7 @@ class SliderCrank(AbstractExample):
         return jnp.zeros_like(v).at[0].set(self.torque.astype(v.dtype))
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Compute the energy minus the work M θ of the torque, which is conserved."""
+        """Compute the conserved difference of the energy and the torque's work M θ."""
         return {"energy_less_work": self.energy(t, q, v) - self.torque * q[0]}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:

@@ -29,15 +29,16 @@ class Snakeboard(AbstractGaitMachine):
          -sin(θ + φ_f) ẋ + cos(θ + φ_f) ẏ + l cos φ_f θ̇),
 
     with q = (x, y, θ, ψ, φ_b, φ_f): the centre [m] and heading [rad] of the board, and
-    the angles of rotor, rear and front axle relative to the board [rad]. The axles lie
-    l behind and ahead of the centre, and do not slip sideways. If φ_b = φ_f = π/2, the
-    constraints are dependent.
+    the angles of rotor, rear and front axle relative to the board [rad]. The axles are
+    at the distance l behind and ahead of the centre, and do not slip sideways. If
+    φ_b = φ_f = π/2, the constraints are dependent.
 
-    The joints are either prescribed by a `gait`, Γ = (ψ, φ_b, φ_f) - gait(t), or with
-    `gait=None` they move freely under the torques (τ_ψ, τ_b, τ_f) [N m] in `args`, of
-    shape (3,) or `None`. By default the rotor oscillates at the frequency of the
-    steering, which drives the board from rest along its axis. With other ratios of the
-    frequencies, the board turns in place or moves sideways (parking gait).
+    A `gait` prescribes the joints by the constraints Γ = (ψ, φ_b, φ_f) - gait(t). With
+    `gait=None` the joints move freely under the torques (τ_ψ, τ_b, τ_f) [N m] in
+    `args`, of shape (3,) or `None`. In the default gait the rotor oscillates at the
+    frequency of the steering, and this gait drives the board from rest along its axis.
+    With other ratios of the frequencies, the board turns in place or moves sideways
+    (parking gait).
 
     **Parameters:** `mass` m [kg]; `inertia` J of the board, `rotor_inertia` J_r and
     `axle_inertia` J_w about the vertical [kg m²]; `half_length` l [m]; `gait`, a
@@ -92,7 +93,7 @@ class Snakeboard(AbstractGaitMachine):
     ) -> "Snakeboard":
         """Create a board at the origin whose centre moves ahead at `speed`, θ = 0.
 
-        Its sideways velocity and its turning rate follow from the constraints.
+        The sideways velocity and the turning rate follow from the constraints.
         `parameters` are the parameters of the class; without a `gait` among them the
         joints move freely.
         """
@@ -154,9 +155,10 @@ class Snakeboard(AbstractGaitMachine):
         return jnp.concatenate([jnp.zeros_like(v[:3]), torques])
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Compute the energy and the momenta of the joints, for joints without torques.
+        """Compute the energy and the momenta of the joints.
 
-        With a gait there are no conserved quantities.
+        They are conserved if the joints move freely and without torques. With a gait
+        there are no conserved quantities.
         """
         if self.gait is not None:
             return {}

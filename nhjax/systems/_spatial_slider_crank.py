@@ -21,7 +21,7 @@ from ._base import (
 
 
 class SpatialSliderCrank(AbstractExample):
-    """A crank that drives a slider which runs along the crank's own axis.
+    """A crank that drives a slider, which runs parallel to the axle of the crank.
 
     L = J/2 θ̇² + m_r/2 |ċ|² + A/2 ω₁² + B/2 (ω₂² + ω₃²) + m_s/2 ẋ² - m_r g c_z
     - m_c g r/2 cos θ,
@@ -29,15 +29,17 @@ class SpatialSliderCrank(AbstractExample):
     Φ = s - l e(α, β) - p(θ),  e = (cos β, sin α sin β, -cos α sin β),
     p = (0, y₀ - r sin θ, z₀ + r cos θ),  s = (x, 0, 0),
 
-    with q = (θ, α, β, x): the angle of the crank about the x-axis, the two angles of
-    the universal joint at the slider [rad], and the place of the slider [m]. The rod
-    has the angular velocity ω = (α̇ cos β, β̇, α̇ sin β) in its own axes, of which the
-    first is e. It ends in a spherical joint at the pin p of the crank. The centre of
-    the rod is c, and J = I_c + m_c r²/4.
+    with q = (θ, α, β, x): the angle of the crank about its axle, which is parallel to
+    the x-axis, the two angles of the universal joint at the slider [rad], and the place
+    of the slider [m]. The rod has the angular velocity ω = (α̇ cos β, β̇, α̇ sin β) in
+    its own axes, of which the first is e. The rod ends in a spherical joint at the pin
+    p of the crank. The centre of the rod is c, and J = I_c + m_c r²/4 is the moment of
+    inertia of the crank about its axle.
 
     **Parameters:** `crank_length` r, `rod_length` l, `axle` (y₀, z₀) [m]; `crank_mass`
-    m_c, `rod_mass` m_r, `slider_mass` m_s [kg]; `crank_inertia` I_c about its middle,
-    `rod_inertias` (A, B) along and across the rod [kg m²]; `gravity` g [m/s²].
+    m_c, `rod_mass` m_r, `slider_mass` m_s [kg]; `crank_inertia` I_c about the middle of
+    the crank, `rod_inertias` (A, B) along and across the rod [kg m²]; `gravity` g
+    [m/s²].
 
     **Source:** Haug, *Computer Aided Kinematics and Dynamics of Mechanical Systems*
     (1989), section 12.2; the problem "spatial rigid slider-crank mechanism" of the
@@ -88,9 +90,9 @@ class SpatialSliderCrank(AbstractExample):
     def turning(
         cls, angle: ArrayLike, rate: ArrayLike, **parameters: Any
     ) -> "SpatialSliderCrank":
-        """Create a mechanism with the crank at `angle` and `rate`, the slider at x > 0.
+        """Create a mechanism with the crank at `angle`, which turns at `rate`.
 
-        `parameters` are the parameters of the class.
+        The slider is at x > 0. `parameters` are the parameters of the class.
         """
         machine = cls(**parameters)
         length = machine.rod_length.astype(machine.axle.dtype)
@@ -114,7 +116,7 @@ class SpatialSliderCrank(AbstractExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         return LagrangianSystem(self.lagrangian, holonomic=self.holonomic)
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:

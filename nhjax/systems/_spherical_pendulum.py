@@ -76,7 +76,7 @@ class SphericalPendulum(AbstractExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         return LagrangianSystem(self.lagrangian, holonomic=self.holonomic)
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
@@ -97,8 +97,9 @@ class SphericalPendulum(AbstractExample):
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute (q, v, λ) at `t`, for every consistent (`q0`, `v0`).
 
-        The height is z = z₁ + (z₂ - z₁) sn², and determines the multiplier. Then x and
-        y satisfy the linear equation m ẍ = 2λx, which is solved to round-off.
+        The height is z = z₁ + (z₂ - z₁) sn², with its smallest and largest values z₁
+        and z₂, and determines the multiplier λ. Then x satisfies the linear equation
+        m ẍ = 2λx, and y the same equation; both are solved to round-off.
         """
         require_consistent("q0", self.holonomic(0.0, self.q0, None), self.q0)
         require_consistent("v0", self.q0 @ self.v0, self.v0)
@@ -127,7 +128,7 @@ def _height(
     """Create the function that computes (z, ż) at given times.
 
     l²ż² is a cubic in z with the leading coefficient 2g and the roots z₁ <= z₂ <= z₃.
-    It is written in powers of z - z₀, so that roots near z₀ lose no digits.
+    The cubic is written in powers of z - z₀, so that roots near z₀ lose no digits.
     """
     z0, dz0 = q0[2], v0[2]
     kinetic, radius_squared = 0.5 * (v0 @ v0), q0[0] ** 2 + q0[1] ** 2

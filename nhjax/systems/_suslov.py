@@ -25,10 +25,10 @@ class Suslov(AbstractConstrainedGroupExample):
 
     ℓ = ½ ω·Iω,  φ = ω₃,
 
-    with q the attitude, a quaternion, and ω the body angular velocity; the axes have
-    I₁₂ = 0. If the axis e₃ is not a principal axis, every motion tends to a steady
-    rotation about an axis in the plane of e₁ and e₂: these rotations are attracting,
-    although energy is conserved.
+    with the attitude quaternion q and the body angular velocity ω. The body axes are
+    chosen so that I₁₂ = 0. If the axis e₃ is not a principal axis, every motion tends
+    to a steady rotation about an axis in the plane of e₁ and e₂: these rotations are
+    attracting, although energy is conserved.
 
     **Parameters:** `moments` (I₁₁, I₂₂, I₃₃) and `products` (I₁₃, I₂₃) of inertia
     [kg m²]; `retraction`, the retraction of SO(3).
@@ -86,9 +86,10 @@ class Suslov(AbstractConstrainedGroupExample):
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute (q, v, λ) at `t`, for consistent data and `products` != 0.
 
-        With √I₁₁ ω₁ = √(2E) cos α and √I₂₂ ω₂ = √(2E) sin α, α̇ = κ cos(α - α*): the
-        components of ω are tanh and sech functions. The attitude then satisfies a
-        linear differential equation, which is solved to round-off.
+        Let √I₁₁ ω₁ = √(2E) cos α and √I₂₂ ω₂ = √(2E) sin α. Then α satisfies
+        α̇ = κ cos(α - α*), so that the components of ω are combinations of tanh and
+        sech. The attitude satisfies a linear differential equation, which is solved to
+        round-off.
         """
         quaternion, v0 = self._consistent_data()
         I1, I2, _ = np.asarray(self.moments, dtype=np.float64)

@@ -27,19 +27,20 @@ class TurntableBall(AbstractConstrainedGroupExample):
     ℓ = ½ (v_x² + v_y²) + r²/2 (a ω₁² + b ω₂² + c ω₃²),
     φ = (v_x + Ωy - r ω_η, v_y - Ωx + r ω_ξ),
 
-    on SO(3) x R²: q = (attitude, (x, y)) with the attitude R a quaternion, v = (ω₁, ω₂,
-    ω₃, v_x, v_y) with the body angular velocity ω; the centre of mass is the centre of
-    the ball, and its mass is one. The constraints are affine, so that energy is not
-    conserved, but the moving energy E - Ω(x v_y - y v_x) is.
+    on SO(3) x R², with q = (R, (x, y)): the attitude quaternion and the position of the
+    centre of the ball; v = (ω₁, ω₂, ω₃, v_x, v_y) with the body angular velocity ω. The
+    centre of mass is the centre of the ball, and the mass of the ball is one. The
+    constraints are affine, so that the energy E is not conserved, but the moving energy
+    E - Ω(x v_y - y v_x) is conserved.
 
-    The constraints contain (ω_ξ, ω_η, ω_ζ), which is
+    The constraints contain an angular velocity (ω_ξ, ω_η, ω_ζ), which `frame` selects:
 
-    - with `frame="space"` (the default) the spatial angular velocity Rω: the physical
-        ball;
-    - with `frame="body"` ω itself: the constraints of the paper as printed, with ξ, η,
-        ζ the principal axes. For a homogeneous ball, a = b = c, the motion of (x, y)
-        and of (ω_ξ, ω_η, ω_ζ) is the same in both; for unequal moments this is another
-        mechanical system.
+    - `frame="space"` (the default) selects the spatial angular velocity Rω, as for a
+        physical ball.
+    - `frame="body"` selects ω itself along the principal axes ξ, η, ζ, as in the
+        printed constraints of the paper. For a homogeneous ball, a = b = c, the motion
+        of (x, y) and of (ω_ξ, ω_η, ω_ζ) is the same as with `frame="space"`. For
+        unequal moments, the system is not the physical ball.
 
     A homogeneous ball moves on a circle, at the rate κ = Ωa/(1 + a).
 

@@ -1,4 +1,4 @@
-"""A robot on two wheels that motors drive, in the plane."""
+"""A planar robot on two wheels, which are driven by motors."""
 
 from typing import Any
 
@@ -33,17 +33,17 @@ class TwoWheeledRobot(AbstractNonholonomicExample):
     Φ = (n·ṙ, e·ṙ + b θ̇ - ρ φ̇_R, e·ṙ - b θ̇ - ρ φ̇_L).
 
     The multipliers are the forces of the ground [N]: the force to the left on both
-    wheels together, and the forward forces on the right and on the left wheel. Castors
-    are left out.
+    wheels together, and the forward forces on the right and on the left wheel. The
+    model has no castors.
 
     `args` is None or a pair of the torques of the motors on the right and on the left
-    wheel [N m]; without them energy is conserved.
+    wheel [N m]; without torques energy is conserved.
 
     **Parameters:** `mass` m of the platform [kg], its `inertia` I about its centre of
     mass [kg m²] and the `offset` d of this centre ahead of the axle [m]; `half_track`
     b, half of the distance between the wheels, and their `radius` ρ [m]; for each
     wheel, `wheel_mass` m_w [kg], and `axle_inertia` I_w about the axle and
-    `wheel_inertia` I_m about a diameter [kg m²], both with the rotor of its motor.
+    `wheel_inertia` I_m about a diameter [kg m²], both including the motor's rotor.
 
     **Source:** Yamamoto and Yun, *Coordinating locomotion and manipulation of a mobile
     manipulator* (1994); Dhaouadi and Abu Hatab, *Dynamic modelling of
@@ -109,7 +109,7 @@ class TwoWheeledRobot(AbstractNonholonomicExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         return LagrangianSystem(
             self.lagrangian, nonholonomic=self.constraint, force=self.force
         )

@@ -117,7 +117,8 @@ class UnicycleInCoordinates(AbstractConstrainedExample):
 
     L = m/2 (ẋ² + ẏ²) + I/2 θ̇² - k/2 (x² + y²),  Φ = ẏ cos θ - ẋ sin θ,  q = (x, y, θ).
 
-    It has the motion and the multiplier of `Unicycle`, but other discretisation errors.
+    The exact motion and multiplier are the same as for `Unicycle`, but the
+    discretisation errors differ.
 
     **Parameters:** `mass` m [kg], `inertia` I about the vertical [kg m²], `spring` k
     [N/m].

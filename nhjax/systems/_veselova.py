@@ -22,9 +22,10 @@ class Veselova(AbstractConstrainedGroupExample):
 
     ℓ = ½ ω·Jω - w·γ,  φ = γ·ω,  γ = Rᵀ e₃,
 
-    with q the attitude R, a quaternion, ω the body angular velocity, and γ the vertical
-    seen from the body. Without weight, the horizontal part of the angular momentum in
-    space is conserved in addition to the energy, and the problem is integrable.
+    with the attitude quaternion q of the rotation R, the body angular velocity ω, and
+    the vertical γ seen from the body. Without weight, the horizontal part of the
+    angular momentum in space is conserved in addition to the energy, and the problem is
+    integrable.
 
     **Parameters:** `inertia` J, the matrix of inertia about the fixed point [kg m²];
     `weight` w = m g X [N m], with X the centre of mass in the body; `retraction`, the

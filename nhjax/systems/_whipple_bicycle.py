@@ -1,4 +1,4 @@
-"""The Whipple bicycle, which rolls on both wheels, with both kinds of constraints."""
+"""The Whipple bicycle, with nonholonomic constraints and a holonomic constraint."""
 
 import math
 from collections.abc import Callable
@@ -46,27 +46,28 @@ class WhippleBicycle(AbstractNonholonomicExample):
     q = (x, y, ψ, φ, θ, δ, θ_R, θ_F): the contact point of the rear wheel [m], yaw, lean
     (to the right), pitch of the rear frame, steer (to the right) and the angles of the
     wheels relative to their frames [rad]; a wheel that rolls forward has a negative
-    rate. Lean is `q[3]` and steer is `q[5]`; the names are x, y, yaw, lean, pitch,
-    steer, rear_wheel and front_wheel. In a plot of (x, y), a turn to the right looks
-    like a turn to the left, because y points to the right.
+    rate. Lean is `q[3]` and steer is `q[5]`; the names of the coordinates are x, y,
+    yaw, lean, pitch, steer, rear_wheel and front_wheel. In a plot of (x, y), a turn to
+    the right looks like a turn to the left, because y points to the right.
 
     The coordinates imply that the rear wheel touches the ground. The holonomic
     constraint is the depth of the front wheel's lowest point below the ground, and Φ
     are the horizontal velocities in space of the points of the rear and of the front
-    wheel that touch the ground. The multipliers are the forces (x, y) of the ground on
-    the rear and on the front wheel, and the force z on the front wheel.
+    wheel that touch the ground. The multipliers are forces of the ground: the x and y
+    components on the rear wheel, the x and y components on the front wheel, and the z
+    component on the front wheel.
 
     `WhippleBicycle.running(speed, lean=, lean_rate=, steer=, steer_rate=)` creates a
     bicycle that rolls; all these arguments are zero by default, except the speed of
-    4.6 m/s. `steering` gives the torque on the steer axis: `SteerTorque()` reads a
-    number from `args`; `LeanToSteer(lean_gain=0.0, lean_rate_gain=20.0)` is a rider;
-    or pass your own function of (t, q, v, args), or None for an uncontrolled bicycle,
-    whose energy is conserved. If your function needs `args`, pass them also to
-    `initial_state(args=...)`.
+    4.6 m/s. `steering` gives the torque on the steer axis: `SteerTorque()` reads the
+    torque from `args`, and `LeanToSteer(lean_gain=0.0, lean_rate_gain=20.0)` is a rider
+    who steers into the fall. You may also pass your own function of (t, q, v, args).
+    With None, the default, the bicycle is uncontrolled, and its energy is conserved. If
+    the torque depends on `args`, pass them also to `initial_state(args=...)`.
 
-    Nothing stops the handlebar of a bicycle that falls: the velocities grow without
-    bound, until no step size is small enough. End the run with an `Event` before |lean|
-    reaches 0.8 or |steer| reaches 1.
+    The model has no stop for the handlebar. When the bicycle falls, its velocities
+    therefore grow without bound, until no step size is small enough. End the run with
+    an `Event` before |lean| reaches 0.8 or |steer| reaches 1.
 
     **Parameters:** `wheelbase` w, `trail` c [m], `tilt` λ of the steer axis [rad],
     `gravity` g [m/s²]. For the wheels: `rear_radius`, `front_radius` [m],
@@ -148,8 +149,8 @@ class WhippleBicycle(AbstractNonholonomicExample):
     ) -> "WhippleBicycle":
         """Create a bicycle that rolls, with the given lean, steer and their rates.
 
-        `speed` is the radius of the rear wheel times its rate. Pitch
-        and all other rates follow from the constraints.
+        `speed` is the radius of the rear wheel times the rate at which the wheel turns.
+        Pitch and all other rates follow from the constraints.
         """
         given = (lean, steer, lean_rate, steer_rate, speed)
         bicycle = cls(**parameters)
@@ -164,7 +165,7 @@ class WhippleBicycle(AbstractNonholonomicExample):
 
     @property
     def system(self) -> LagrangianSystem:
-        """Return the system to integrate, whose leaves are the parameters."""
+        """Return the system to integrate; its pytree leaves are the parameters."""
         return LagrangianSystem(
             self.lagrangian,
             nonholonomic=self.constraint,
@@ -308,10 +309,10 @@ class SteerTorque(eqx.Module):
 
 
 class LeanToSteer(eqx.Module):
-    """A rider who steers into the fall: the torque K φ + D φ̇ of the lean angle φ.
+    """A rider who steers into the fall with the torque K φ + D φ̇, where φ is the lean.
 
     **Parameters:** `lean_gain` K [N m/rad] and `lean_rate_gain` D [N m s/rad]. The
-    default keeps the bicycle of `WhippleBicycle` upright at 2 to 6 m/s.
+    default gains keep the default `WhippleBicycle` upright at 2 to 6 m/s.
 
     **Source:** Schwab, Kooijman and Meijaard, *Some recent developments in bicycle
     dynamics and control* (2008).
