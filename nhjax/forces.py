@@ -329,7 +329,7 @@ class PointForce(_AbstractPulledBack):
 
 
 class Torque(_AbstractPulledBack):
-    """A torque on a body in space whose rotation is given.
+    """A torque on a body in space, whose attitude is a function of (t, q, args).
 
     F · v = τ · ω with the angular velocity ω of the body, hat(ω) = Ṙ Rᵀ.
 

@@ -194,8 +194,8 @@ class Surface(AbstractGround):
     **Arguments:**
 
     - `elevation`: f, called as `elevation(x, args)` with x of shape (2,) [m]; returns a
-        scalar [m]. f must be smooth. `Heightfield` is such a function, from heights on
-        a grid.
+        scalar [m]. f must be smooth. `Heightfield` is such a function, which
+        interpolates heights on a grid.
     - `velocity`: as for `Plane`.
 
     !!! example

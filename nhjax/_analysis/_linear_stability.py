@@ -109,11 +109,11 @@ def linear_stability(
     - `positions`, `velocities`: the indices of the independent coordinates and of the
         independent velocities (of momenta for a Hamiltonian system), which form z. All
         other velocities must follow from the constraints, so that there are n - m - k
-        independent velocities. Positions that are not independent and do not follow
-        from holonomic constraints are not perturbed. Omit coordinates on which the
-        motion does not depend, such as the position of a wheel. By default, z consists
-        of coordinates in an orthonormal basis of all perturbations that the constraints
-        permit.
+        independent velocities. Coordinates that are not in `positions`
+        and do not follow from holonomic constraints are not perturbed. Omit coordinates
+        on which the motion does not depend, such as the position of a wheel. By
+        default, z consists of coordinates in an orthonormal basis of all perturbations
+        that the constraints permit.
     - `symmetry`: generators of symmetries, as vector fields like the generator of
         `momentum_map`: called as `symmetry(q)`, of shape (n,) or (k, n), in the
         components of the velocity. On a group, the generator of g -> g exp(εξ), a

@@ -207,7 +207,11 @@ def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
     gravity = mechanics.gravity if np.any(mechanics.gravity) else None
 
     def inertias(args, dtype):
-        """Compute the inertia M and the weight (m c, m) of each node, as lists."""
+        """Compute M and (m c, m) of each node, as lists.
+
+        M is the spatial inertia, m the mass without the part that gravity compensation
+        carries, and c the centre of m.
+        """
         inertia, moment = total.tolist(), total_moment.tolist()
         masses = args.get("mass", {})
         for i in changed:

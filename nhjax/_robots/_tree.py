@@ -401,7 +401,7 @@ class Tree:
         return jnp.concatenate(twists)
 
     def _relative(self, q: PyTree[Array], args: Args) -> tuple[Array, Array]:
-        """Compute the pose of each node relative to the node before it."""
+        """Compute the pose of each node relative to its parent."""
         elements, scalars = self.space.split(q)
         dtype = scalars.dtype
         rotations, positions = [], []

@@ -19,7 +19,8 @@ class ChaplyginSphere(AbstractRollingBody):
     with q = (R, x): the attitude quaternion and the position of the centre, which
     is also the centre of mass [m]; (v, ω) are their body velocities along the principal
     axes [m/s, 1/s]. Φ is the height of the contact, and φ the horizontal velocity
-    there; their multipliers are the force of the plane in space [N].
+    there. The multipliers are the components, along the axes of space, of the force
+    that the plane exerts on the sphere [N].
 
     The angular momentum about the contact, R K with K = I ω + m r² (ω - (ω·γ) γ), is
     constant in space, so that |K|² and K·γ are constant too, and the system is

@@ -26,7 +26,8 @@ class ChaplyginTop(AbstractRollingBody):
     [m]; (v, ω) are their body velocities along the principal axes [m/s, 1/s]. If the
     third axis is upward, the centre of mass is below the centre of the sphere by a. The
     contact is s, seen from the centre of mass; Φ is its height, and φ the horizontal
-    velocity there. The multipliers are the force of the plane in space [N].
+    velocity there. The multipliers are the components, along the axes of space, of the
+    force that the plane exerts on the sphere [N].
 
     If I₁ = I₂, the body is Routh's sphere, which is integrable. Besides the energy, two
     quantities are then conserved: Jellett's integral K·s, with the angular momentum K

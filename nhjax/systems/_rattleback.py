@@ -29,10 +29,11 @@ class Rattleback(AbstractRollingBody):
     with q = (R, x): the attitude quaternion and the position of the centre of mass
     [m]; (v, ω) are their body velocities [m/s, 1/s]. The body axes are the axes of the
     ellipsoid; at rest, the third axis points upward. The lowest point is s, seen from
-    the centre of mass. Φ is its height, and φ the horizontal velocity at the contact;
-    their multipliers are the force of the plane in space [N]. The third axis is a
-    principal axis of inertia, but the other two axes are not. Therefore a spin in one
-    sense turns into rocking, and the rocking into a spin in the other sense.
+    the centre of mass. Φ is its height, and φ the horizontal velocity at the contact.
+    The multipliers are the components, along the axes of space, of the force that the
+    plane exerts on the body [N]. The third axis is a principal axis of inertia, but the
+    other two axes are not. Therefore a spin in one sense turns into rocking, and the
+    rocking into a spin in the other sense.
 
     With `damping` σ the air exerts the torque -σω, and energy is not conserved.
 

@@ -27,9 +27,9 @@ class RollingTorus(AbstractRollingBody):
     with q = (R, x): the attitude quaternion and the position of the centre [m]; (v,
     ω) are their body velocities [m/s, 1/s], and the third body axis is the axle. The
     lowest point is s, seen from the centre; Φ is its height, and φ the horizontal
-    velocity at the contact. The multipliers are the force of the plane in space [N].
-    With r = 0, the default, the body is a disc of zero thickness: Euler's disc without
-    slip.
+    velocity at the contact. The multipliers are the components, along the axes of
+    space, of the force that the plane exerts on the body [N]. With r = 0, the default,
+    the body is a disc of zero thickness: Euler's disc without slip.
 
     The axle must not be vertical, because the lowest point is not unique then. In a
     steady motion the tilt is constant, and the centre moves on a circle or rests;

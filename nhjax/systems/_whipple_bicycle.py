@@ -39,9 +39,11 @@ _ANGLES = ("yaw", "lean", "pitch", "steer", "rear_wheel", "front_wheel")
 class WhippleBicycle(AbstractNonholonomicExample):
     """A bicycle of four rigid bodies that rolls on two thin wheels.
 
-    L = Σ ½ m |ċ|² + ½ ωᵀ I ω + m g c_z over the rear wheel, the rear frame with its
-    rider, the front frame and the front wheel, in the axes of the source: x forward, y
-    to the right, z down.
+    L = Σ ½ m |ċ|² + ½ ωᵀ I ω + m g c_z.
+
+    The sum is over the rear wheel, the rear frame with its rider, the front frame and
+    the front wheel. The axes are the axes of the source: x forward, y to the right, z
+    down.
 
     q = (x, y, ψ, φ, θ, δ, θ_R, θ_F): the contact point of the rear wheel [m], yaw, lean
     (to the right), pitch of the rear frame, steer (to the right) and the angles of the
