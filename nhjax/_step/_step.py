@@ -545,6 +545,17 @@ def estimated_error(ratios: Float[Array, "2"], method: AbstractMethod) -> FloatS
 Changes: TypeAlias = tuple[StageUnknowns, State, StepRecord]
 
 
+class FrozenIteration(NamedTuple):
+    """A Newton iteration on the stages with a frozen Jacobian.
+
+    - `newton_map`: the iteration.
+    - `units`: the units of the unknowns; see `unknown_units`.
+    """
+
+    newton_map: FrozenNewtonMap
+    units: list[FloatScalar]
+
+
 class ImplicitStep(AbstractImplicitFunction[StepArguments, StepOutcome]):
     """A step as a differentiable function of its arguments.
 
@@ -573,53 +584,62 @@ class ImplicitStep(AbstractImplicitFunction[StepArguments, StepOutcome]):
         self, arguments: StepArguments, rates: StepArguments, solution: StepOutcome
     ) -> StepOutcome:
         """Compute the tangents of the stages, the state at the end and the record."""
-        x, ok = solution.stages, ~self.skip & (solution.result == RESULTS.successful)
+        ok = ~self.skip & (solution.result == RESULTS.successful)
         perturbed, fixed = eqx.partition(arguments, has_tangent(rates))
-        changes = self.changes(arguments, fixed, x, ok)
-        # With `jax.checkpoint`, reverse mode stores only states and stages.
+
+        def changes(perturbed, x, rates):
+            iteration = self.frozen_iteration(arguments, x)
+            return self.changes(iteration, perturbed, fixed, x, rates, ok)
+
+        # With `jax.checkpoint`, reverse mode stores only states and stages. It computes
+        # the factors of the Jacobian in its own pass.
         changes = jax.checkpoint(changes, prevent_cse=False)
-        return tangent_of_outcome(solution, changes(perturbed, x, rates))
+        return tangent_of_outcome(solution, changes(perturbed, solution.stages, rates))
+
+    def frozen_iteration(
+        self, arguments: StepArguments, x: StageUnknowns
+    ) -> FrozenIteration:
+        """Build the Newton iteration with its Jacobian frozen at solved stages x."""
+        stages = equations_of_step(arguments, self.method)
+        at, lin, solved = stop_gradient((stages, arguments.step_state.lin, x))
+        newton_map = self.stage_solver.frozen_newton_map(at, lin, solved)
+        return FrozenIteration(newton_map, unknown_units(at, lin))
 
     def changes(
         self,
-        arguments: StepArguments,
+        frozen: FrozenIteration,
+        perturbed: StepArguments,
         fixed: StepArguments,
         x: StageUnknowns,
+        rates: StepArguments,
         ok: BoolScalar,
-    ) -> Callable[[StepArguments, StageUnknowns, StepArguments], Changes]:
-        """Return the function (perturbed, x, rates) -> the changes of a solved step.
+    ) -> Changes:
+        """Compute the changes of the stages x, of the state at the end and the record.
 
         The `perturbed` part of the arguments changes at `rates`, and the other part is
-        `fixed`. The function computes the changes of the stages x, of the state at the
-        end and of the record of the step. They are zero unless the step is `ok`.
+        `fixed`. The changes are zero unless the step is `ok`, that is, solved.
         """
-        stages = equations_of_step(arguments, self.method)
-        at, lin, solved = stop_gradient((stages, arguments.step_state.lin, x))
-        frozen_newton_map = self.stage_solver.frozen_newton_map(at, lin, solved)
-        # The solver started from a good guess. This iteration starts from zero, so it
-        # may take twice as many iterations.
-        limit = 2 * self.stage_solver.max_iterations
 
         def iteration(perturbed, x):
             arguments = eqx.combine(perturbed, fixed)
-            return frozen_newton_map(equations_of_step(arguments, self.method), x)
+            return frozen.newton_map(equations_of_step(arguments, self.method), x)
 
         def end(perturbed, x):
             return _end(eqx.combine(perturbed, fixed), self.method, x)
 
-        def changes(perturbed, x, rates):
-            rates, units = zero_unless(ok, rates), unknown_units(at, lin)
-            dx = fixed_point_tangent(
-                iteration, perturbed, rates, x, units, max_iterations=limit
-            )
-            _, dend = jax.jvp(
-                ClosureConverted(end, perturbed, x),
-                (perturbed, x),
-                (rates, zero_unless(ok, dx)),
-            )
-            return zero_unless(ok, (dx, *dend))
-
-        return changes
+        rates = zero_unless(ok, rates)
+        # The solver started from a good guess. This iteration starts from zero, so it
+        # may take twice as many iterations.
+        limit = 2 * self.stage_solver.max_iterations
+        dx = fixed_point_tangent(
+            iteration, perturbed, rates, x, frozen.units, max_iterations=limit
+        )
+        _, dend = jax.jvp(
+            ClosureConverted(end, perturbed, x),
+            (perturbed, x),
+            (rates, zero_unless(ok, dx)),
+        )
+        return zero_unless(ok, (dx, *dend))
 
 
 def tangent_of_outcome(outcome: StepOutcome, changes: Changes) -> StepOutcome:

@@ -205,19 +205,17 @@ class ImplicitTruncatedStep(AbstractImplicitFunction[Given, TruncatedStep]):
         )
         size, rest = eqx.partition(arguments, is_size)
         unit = eqx.tree_at(lambda x: x.h, size, jnp.ones_like(step.h))
-        x = step.outcome.stages
-        change_with = self.step.changes(arguments, fixed, x, ok)
-        change_with_size = self.step.changes(arguments, rest, x, is_truncated)
 
         def condition(given, fixed, functions, y):
             at, all_of_them = eqx.combine(given, fixed), eqx.combine(functions, others)
             return _values(at, all_of_them, self.step.method, y)[step.fired]
 
         def changes(given, functions, x, y, rates):
-            change = change_with(given, x, rates[0])
+            frozen = self.step.frozen_iteration(arguments, x)
+            change = self.step.changes(frozen, given, fixed, x, rates[0], ok)
             by_size = jax.lax.cond(
                 is_truncated,
-                lambda: change_with_size(size, x, unit),
+                lambda: self.step.changes(frozen, size, rest, x, unit, is_truncated),
                 lambda: jax.tree.map(jnp.zeros_like, change),
             )
             _, slope = jax.jvp(
