@@ -163,6 +163,37 @@ def test_growth_with_coordinates_quoted_agrees_with_the_result():
     assert_agree(quoted(page("performance"), sentence), [fitted])
 
 
+# The axes of `benchmarks.scaling`, and the first heading of the table of each.
+GROWTHS = {"n": "coordinates", "k": "constraints", "chain": "", "star": ""}
+
+
+def test_growth_of_costs_quoted_agrees_with_the_result():
+    found = results("scaling")
+    points = {axis: {x["size"]: x for x in found[axis]["rows"]} for axis in GROWTHS}
+    for axis in ("n", "k"):
+        rows = rows_of(page("when_not"), GROWTHS[axis], "step [µs]")
+        for size, *cells in rows:
+            point = points[axis][int(size)]
+            assert_agree(cells, [point["step"], point["compile"]])
+    *rows, last = rows_of(page("performance"), "constraints", "chain", "star")
+    for size, *cells in rows:
+        steps = [points[axis][int(size)]["step"] for axis in ("chain", "star")]
+        assert_agree(cells, steps)
+    fitted = [found[axis]["step"]["fitted"] for axis in ("chain", "star")]
+    assert_agree(last[1:], fitted)
+    sentence = "from {} to {} µs in a chain, and from {} to {} µs in a star"
+    printed = quoted(page("when_not"), sentence)
+    ends = [points[axis][k]["step"] for axis in ("chain", "star") for k in (10, 100)]
+    assert_agree(printed, ends)
+
+
+def test_first_calls_of_the_bicycle_quoted_agree_with_the_result():
+    rows = {row["machine"]: row for row in results("machines")["rows"]}
+    row = rows["WhippleBicycle"]
+    sentence = "the first call takes {} s for a run and {} s for its gradient"
+    assert_agree(quoted(page("when_not"), sentence), [row["run"], row["gradient"]])
+
+
 def test_ensemble_costs_quoted_agree_with_the_result():
     found = results("ensembles")
     text = page("ensembles")
