@@ -10,6 +10,7 @@ import pytest
 
 import nhjax
 from nhjax import LobattoIIIAB, SaveAt, systems
+from nhjax._step import first_step_state
 from support.driven import Driven
 from support.helpers import (
     central_difference,
@@ -264,3 +265,29 @@ def test_memory_of_each_adjoint_grows_as_documented():
     assert temporary(REVERSIBLE, 10_000) == temporary(REVERSIBLE, 100)
     assert temporary(CHECKPOINTS, 10_000) <= 10 * temporary(CHECKPOINTS, 100)
     assert 50 * temporary(DIRECT, 100) < temporary(DIRECT, 10_000)
+
+
+@pytest.mark.long
+def test_direct_adjoint_stores_only_states_and_stages_of_each_step():
+    example, stages = systems.ChaplyginSleigh(), 3
+    y0, method = example.initial_state(), LobattoIIIAB(stages)
+    n, m = y0.p.size, y0.multiplier.size
+
+    def stored(num_steps):
+        def loss(y0):
+            sol = nhjax.integrate(
+                example.system, method, y0, dt=0.1, num_steps=num_steps
+            )
+            return jnp.sum(sol.ys.q**2)
+
+        memory = jax.jit(jax.grad(loss)).lower(y0).compile().memory_analysis()
+        assert memory is not None
+        return memory.temp_size_in_bytes
+
+    first = first_step_state(example.system, method, jnp.zeros(()), y0, None)
+    state = sum(x.size for x in jax.tree.leaves(first))
+    # The unknowns are the stages, the nodes, the closure and the end of the step.
+    unknowns = stages * n + (stages - 1) * (n + m) + n + m
+    numbers = (stored(2000) - stored(1000)) / (1000 * y0.p.itemsize)
+    # The Jacobian has 81 numbers more for the stages alone.
+    assert numbers <= state + unknowns + 2
