@@ -1,9 +1,9 @@
 """Coefficients of polynomials, lowest power first.
 
-A comment "f(x) in z" names the approximated function f and the variable z of the
-polynomial, which interpolates f at Chebyshev's nodes. `python
-tests/support/approximations.py` computes and prints the coefficients, and `tests/lanes`
-checks the errors of the polynomials.
+A comment "f(x) in z" names the approximated function f and the variable z of
+the polynomial, which interpolates f at Chebyshev's nodes. `python
+tests/support/approximations.py` computes and prints the coefficients, and
+`tests/lanes` checks the errors of the polynomials.
 """
 
 # (sin(x) / x - 1) / x**2 in x**2, for |x| up to pi / 4.

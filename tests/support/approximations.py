@@ -74,7 +74,7 @@ APPROXIMATIONS = {
     "LOG_LONG": Approximation(
         lambda z: (_log_ratio(z) - 1 - z / 3) / z**2,
         lambda z: z**2, 0, S_SQUARED, 8,
-        "(artanh(s) / s - 1 - s**2 / 3) / s**4 in s**2, for powers.",
+        "(artanh(s) / s - 1 - s**2 / 3) / s**4 in s**2, for the function `pow`.",
     ),
     "ATAN": Approximation(
         lambda z: (mpmath.atan(mpmath.sqrt(z)) / mpmath.sqrt(z) - 1) / z,
@@ -143,8 +143,10 @@ def module() -> str:
     lines = [
         '"""Coefficients of polynomials, lowest power first.',
         "",
-        "They interpolate at Chebyshev's nodes, and are computed and printed by",
-        "`python tests/support/approximations.py`. `tests/lanes` checks their errors.",
+        'A comment "f(x) in z" names the approximated function f and the variable z of',
+        "the polynomial, which interpolates f at Chebyshev's nodes. `python",
+        "tests/support/approximations.py` computes and prints the coefficients, and",
+        "`tests/lanes` checks the errors of the polynomials.",
         '"""',
     ]
     for name, given in APPROXIMATIONS.items():
