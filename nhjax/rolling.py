@@ -520,8 +520,9 @@ class Wheel(AbstractContact):
     = n x `along`.
 
     The axle must not be perpendicular to the ground, because then no single point of
-    the rim is the lowest. A track that runs over a sprocket is a wheel too, with the
-    radius of the sprocket, under the middle of the track.
+    the rim is the lowest. A track that runs over a sprocket is modelled as
+    a wheel, too: a wheel with the radius of the sprocket that touches the ground under
+    the middle of the track.
 
     **Arguments:**
 

@@ -100,7 +100,7 @@ class AbstractStepSizeController(eqx.Module):
         return False
 
     def checks(self) -> list[Check]:
-        """Return the checks of numbers that are traced."""
+        """Return the checks of parameters of the controller that are traced."""
         return []
 
     @abstractmethod

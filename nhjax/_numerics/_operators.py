@@ -615,8 +615,9 @@ def block_tridiagonal_inverse(
     count = -(-size // (3 * g)) * 3
     ordered = static_take(products, pattern.order)
     ordered = jnp.pad(ordered, (*[(0, 0)] * 4, (0, count * g - size)))
-    # The axes: equation, unknown, block number modulo three, column in the block, group
-    # of three blocks, block inside the group, row in the block.
+    # The axes: equation, unknown; for the column, its block number modulo three and its
+    # place in the block; for the row, its group of three blocks, its block inside the
+    # group, and its place in the block.
     split = ordered.reshape(q, q, 3, g, count // 3, 3, g)
 
     def diagonal(offset):

@@ -81,7 +81,10 @@ def exp2(x: Value) -> Value:
 
 
 def _expm1_parts(x: Value) -> tuple[Value, DoubleDouble, Value]:
-    """Return n, a double-double m with exp(x) - 1 = 2^n m, and 2^-n, for x >= -50."""
+    """Return n, m and 2^-n with exp(x) - 1 = 2^n m, for x >= -50.
+
+    m is a double-double.
+    """
     exponent, (r, rest) = reduce_by_log2(x)
     # For the largest x, 2^-n would be subnormal. It is replaced by 0 for x > 100, where
     # it does not change the result.

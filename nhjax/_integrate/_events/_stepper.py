@@ -575,7 +575,10 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         return RunEnd(state, t1, rows, reported_log(log, carry.place.num_events))
 
     def differentiable(self, carry: EventCarry) -> tuple[State, FloatScalar]:
-        """Return the state and the time since the last node, or their cotangents."""
+        """Return the state and the time since the last node.
+
+        If `carry` is a cotangent, return the cotangents of both.
+        """
         return carry.step_state.state, carry.place.offset
 
     def reverse_replay(
