@@ -289,5 +289,6 @@ def test_direct_adjoint_stores_only_states_and_stages_of_each_step():
     # The unknowns are the stages, the nodes, the closure and the end of the step.
     unknowns = stages * n + (stages - 1) * (n + m) + n + m
     numbers = (stored(2000) - stored(1000)) / (1000 * y0.p.itemsize)
-    # The Jacobian has 81 numbers more for the stages alone.
-    assert numbers <= state + unknowns + 2
+    # Some numbers are stored twice, such as the position with a wrapped angle. The
+    # Jacobian of the stages alone would have 81 numbers.
+    assert numbers < 1.2 * (state + unknowns)
