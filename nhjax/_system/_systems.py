@@ -596,16 +596,9 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         (n,).
     - `manifold`: the configuration manifold; by default R^n with the n of the state.
     - `constraints`: `"independent"` refuses dependent constraints. `"redundant"` allows
-        constraints that follow from others, also nonholonomic constraints that follow
-        from holonomic ones. Many multipliers then have the same reaction. nhjax chooses
-        the multipliers with the least Σ |λ_a B_a|², where |λ_a B_a| is the size of the
-        reaction of one constraint in the metric M⁻¹. The multiplier of a nonholonomic
-        constraint is zero if the constraint follows from holonomic constraints.
-        `nhjax.Motion.is_unique` says which multipliers the equations determine.
-        `docs/systems.md` has the details.
-    - `coordinates`: a tuple of the names of the n coordinates, for
-        `Solution.to_xarray` and for `keep_q`, `keep_v` and `keep_p` of `initial_state`;
-        None by default.
+        constraints that follow from others, as in a `LagrangianSystem`.
+    - `coordinates`: a tuple of the names of the n coordinates, as in a
+        `LagrangianSystem`; None by default.
 
     !!! example
 
