@@ -33,7 +33,7 @@ from ._report import markdown_table, number, write
 DURATION = 20.0
 LARGEST_DRIFT = 1e-3
 STAGES = (2, 3, 4)
-# For steps as small as those of the reference, the default Jacobian is enough.
+# The steps of the reference solution are small: the default Jacobian solves them.
 REFERENCE_STAGES, REFERENCE_STEPS = 5, 4000
 REPEATS = 20
 # Larger numbers of steps are not tried.

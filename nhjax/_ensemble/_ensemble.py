@@ -23,8 +23,9 @@ from ._sinks import (
 from ._store import CheckpointedReductionSink, ZarrSink
 
 
-# By default a chunk has `_MEMBERS` members for each device, enough to use all cores. It
-# has fewer members if the values of these members would take more than `_BYTES` bytes.
+# The default size of a chunk is `_MEMBERS` members for each device, enough to use all
+# cores. If the values of these members would take more than `_BYTES` bytes, the chunk
+# has fewer members.
 _MEMBERS, _BYTES = 1024, 2**26
 # Suffixes of file formats. `out` names a folder, and must not end in one of them.
 _FILES = (".nc", ".nc4", ".h5", ".hdf5", ".csv", ".npy", ".npz", ".mat", ".pkl")

@@ -232,8 +232,8 @@ def chaotic_energy(
     - `closure`: the closure of the multipliers, as for `nhjax.LobattoIIIAB`; by default
         the closure of the paper.
     - `times`: the times at which to report μ, averaged over a window of ±5. The default
-        is those of the times 10, 50, 100 and 200 that lie within the run, or the final
-        time of a run that is shorter than 10.
+        times are 10, 50, 100 and 200, without times beyond the end of the run. For a
+        run that is shorter than 10, the default is its final time.
     - `save_every`: the number of steps between saved energies.
     - `progress`: whether to show a progress bar for each run on the standard error
         stream.

@@ -289,6 +289,5 @@ def test_direct_adjoint_stores_only_states_and_stages_of_each_step():
     # The unknowns are the stages, the nodes, the closure and the end of the step.
     unknowns = stages * n + (stages - 1) * (n + m) + n + m
     numbers = (stored(2000) - stored(1000)) / (1000 * y0.p.itemsize)
-    # Some numbers are stored twice, such as the position with a wrapped angle. The
-    # Jacobian of the stages alone would have 81 numbers.
+    # A few other numbers are stored too. The Jacobian of the stages alone has 81.
     assert numbers < 1.2 * (state + unknowns)
