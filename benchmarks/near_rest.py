@@ -44,7 +44,6 @@ from nhjax import systems
 from nhjax._numerics import max_norm
 from nhjax._step import (
     first_step_state,
-    round_off_of_steps,
     step,
     StepArguments,
 )
@@ -97,8 +96,7 @@ def first_arguments(system, method, y0, h) -> StepArguments:
     first = first_step_state(system, method, zero, y0, None)
     given = zero, y0.q, system.fibre_coordinate(y0), y0.multiplier, None, h
     noise = function_noise(system, *given)
-    round_off = round_off_of_steps(method, first.lin, noise)
-    return StepArguments(system, zero, h, first, None, round_off=round_off)
+    return StepArguments(system, zero, h, first, None, noise=noise)
 
 
 @eqx.filter_jit

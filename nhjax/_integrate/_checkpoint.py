@@ -145,11 +145,10 @@ def check_start(
     check_state(system, y, "y0.state")
     scalar = jax.ShapeDtypeStruct((), y.p.dtype)
     on_positions = jax.eval_shape(lambda: system.position_constraint(y0.t, y.q, args))
-    violations = y.multiplier, on_positions
     expected = {
         "q_compensation": system.manifold_of(y.q).no_compensation(y.q),
         "p_compensation": y.p,
-        "round_off": (scalar, scalar, scalar, *violations),
+        "round_off": (y.p, y.p, y.multiplier, on_positions),
         "t0": scalar,
         "dt": scalar,
         "num_steps": jax.ShapeDtypeStruct((), jnp.int32),

@@ -7,7 +7,6 @@ the loop, and decides which data reverse mode stores.
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -19,7 +18,6 @@ from jaxtyping import Array, Int
 
 from .._custom_types import FloatScalar
 from .._numerics import with_zero_tangents
-from .._step import RoundOff
 from ._progress_meter import AbstractProgressMeter
 from ._saving import Rows, Saving, static_length
 from ._stepper import AbstractCarry, AbstractStepper, StepResult
@@ -41,10 +39,6 @@ class Loop(eqx.Module):
     def num_iterations(self) -> int | Int[Array, ""]:
         """Return the number of iterations of the loop."""
         return self.stepper.num_iterations
-
-    def with_round_off(self, round_off: RoundOff) -> "Loop":
-        """Return the same loop with the measured round-off of the system."""
-        return replace(self, stepper=self.stepper.with_round_off(round_off))
 
     def step(
         self, carry: AbstractCarry, k: Int[Array, ""], replay: Any = None

@@ -36,7 +36,6 @@ from .._numerics import ClosureConverted
 from .._results import RESULTS
 from .._step import (
     AbstractStageSolver,
-    RoundOff,
     StepRecord,
 )
 from .._system import (
@@ -138,6 +137,7 @@ def run(
     t0 = grid.t0
     given = system, method, y0, grid, args, options, solver_options.stage_solver
     stepper, fn = _stepper(*given)
+    stepper = stepper.with_noise(_noise(stepper, y0))
     plain = stepper.plain
     system, most = plain.system, plain.num_steps
     is_variable, sampled = isinstance(grid, VariableGrid), None
@@ -150,7 +150,7 @@ def run(
     saving = Saving.of(saveat, fn, most, places, stepper.log_length)
     loop = Loop(stepper, saving, solver_options.meter)
     adjoint = solver_options.adjoint
-    round_off, start, carry, rows = _all_steps(adjoint, loop, y0, saveat.checkpoint)
+    start, carry, rows = _all_steps(adjoint, loop, y0, saveat.checkpoint)
     given = (system, y0, t0, grid, args), options.events, options.controller
     end = loop.stepper.finish(carry, (rows.saved, rows.record), rows.log, given)
     # The number of filled rows includes a row for an event that ends the run.
@@ -164,7 +164,7 @@ def run(
     if saveat.dense and records is not None:
         interpolation = _interpolation(plain, grid, records, number)
     if saveat.checkpoint:
-        checkpoint = _checkpoint(stepper, round_off, carry, end.state)
+        checkpoint = _checkpoint(stepper, carry, end.state)
     return Solution(
         t0=t0,
         t1=end.t,
@@ -215,7 +215,7 @@ def _stepper(
         args=args,
         invariants=kept_invariants(options.invariants, system, t0, dt, state, args),
         programs=TraceCache(),
-        round_off=None,
+        noise=None,
         num_steps=num_steps,
     )
     fn, sizes = ClosureConverted(fn, t0, state, args), None
@@ -243,7 +243,7 @@ class _Start(NamedTuple):
     """The start of a run in chunks.
 
     - `carry`, `log`: the carry and the log before the first iteration.
-    - `round_off`: the round-off of the functions of the system.
+    - `noise`: the round-off of the functions of the system.
     - `saved`: the output of the initial state, if it is asked for.
     - `surplus`: the number of iterations that the run may need in addition to one for
         each step; in a run whose steps differ, the number of all iterations.
@@ -252,7 +252,7 @@ class _Start(NamedTuple):
 
     carry: AbstractCarry
     log: PyTree[Array] | None
-    round_off: RoundOff
+    noise: FunctionNoise
     saved: PyTree[Array]
     surplus: IntScalar
     room: int
@@ -305,14 +305,15 @@ def _started(
     grid = grid.of_length(none)
     stepper, fn = _stepper(system, method, y0, grid, args, options, stage_solver)
     noise = _noise(stepper, y0)
-    round_off, carry = as_cpu_kernel(_start, stepper, y0, noise)
+    stepper = stepper.with_noise(noise)
+    carry = as_cpu_kernel(_start, stepper, y0)
     saving = _saving_in_chunks(stepper, fn, none, none, 0, 1)
     loop = Loop(stepper, saving, NoProgressMeter())
     rows = loop.row_shapes(carry)
     return _Start(
         carry,
         loop.empty_rows(carry).log,
-        round_off,
+        noise,
         _saved_if(saves_start, loop, grid.t0, carry.step_state.state),
         jnp.asarray(stepper.num_iterations, jnp.int32),
         room_for((rows.saved, rows.record)),
@@ -328,17 +329,17 @@ def _chunk(
     args: Args,
     options: RunOptions,
     stage_solver: AbstractStageSolver,
-    start: tuple[RoundOff, AbstractCarry, PyTree[Array] | None],
+    start: tuple[FunctionNoise, AbstractCarry, PyTree[Array] | None],
     numbers: Int[Array, " 5"],
     room: int,
     keeps_records: bool,
 ) -> _Chunk:
     """Take the iterations of the `Span` in `numbers`, from the carry in `start`."""
-    round_off, carry, log = start
+    noise, carry, log = start
     span = Span(*numbers)
     grid = grid.of_length(span.num_steps)
     stepper, fn = _stepper(system, method, y0, grid, args, options, stage_solver)
-    stepper = stepper.with_round_off(round_off)
+    stepper = stepper.with_noise(noise)
     num_records = room if keeps_records else 0
     filled = stepper.num_filled(carry, span.start)
     saving = _saving_in_chunks(stepper, fn, filled, span.num_steps, num_records, room)
@@ -362,7 +363,7 @@ def _chunk(
     end = stepper.finish(carry, None, rows.log, None)
     checkpoint = None
     if options.events is None:
-        checkpoint = _checkpoint(stepper, round_off, carry, end.state)
+        checkpoint = _checkpoint(stepper, carry, end.state)
     return _Chunk(
         carry=carry,
         log=rows.log,
@@ -380,14 +381,11 @@ def _chunk(
 
 
 def _checkpoint(
-    stepper: AbstractStepper[Any, Any],
-    round_off: RoundOff,
-    carry: Any,
-    end: State,
+    stepper: AbstractStepper[Any, Any], carry: Any, end: State
 ) -> Checkpoint:
     """Return the checkpoint after the last step of a run without events."""
     owner = stepper if isinstance(stepper, VariableStepper) else stepper.plain
-    return owner.checkpoint(round_off, carry, end)
+    return owner.checkpoint(carry, end)
 
 
 def _saving_in_chunks(
@@ -471,7 +469,7 @@ def run_in_chunks(
         return run(system, method, y0, whole, args, options, saveat, solver_options)
 
     def chunk(carry: AbstractCarry, log: Any, span: Array) -> _Chunk:
-        begun = start.round_off, carry, log
+        begun = start.noise, carry, log
         given_span = span, start.room, keeps_records
         return _chunk(*given, begun, *given_span, captured=captured)
 
@@ -592,47 +590,38 @@ def _sampled_steps(saveat: SaveAt, grid: TimeGrid) -> Int[Array, " k"] | None:
 
 def _all_steps(
     adjoint: AbstractAdjoint, loop: Loop, y0: State | Checkpoint, checkpoint: bool
-) -> tuple[RoundOff, State, AbstractCarry, Rows]:
-    """Take all steps.
+) -> tuple[State, AbstractCarry, Rows]:
+    """Take all steps; return the first state, the last carry and the saved rows."""
 
-    Return the measured round-off, the first state, the last carry and the saved rows.
-    """
+    def steps(loop: Loop, first: AbstractCarry | None, *given: Any):
+        first = _start(loop.stepper, *given) if first is None else first
+        return first.step_state.state, *adjoint.run(loop, loop.moving(first))
 
-    def steps(loop: Loop, started: tuple[RoundOff, AbstractCarry] | None, *given: Any):
-        round_off, first = _start(loop.stepper, *given) if started is None else started
-        loop = loop.with_round_off(round_off)
-        run = adjoint.run(loop, loop.moving(first))
-        return round_off, first.step_state.state, *run
-
-    noise = _noise(loop.stepper, y0)
     if isinstance(y0, State) and not checkpoint:
-        return as_cpu_kernel(steps, loop, None, y0, noise)
+        return as_cpu_kernel(steps, loop, None, y0)
     # If the compiler knows values with which a loop starts, such as zeros in matrices,
     # it generates other instructions for the loop, which round differently. The barrier
     # hides the start values, so that this run and a run resumed from its checkpoint
     # take their steps by the same instructions.
-    started = as_cpu_kernel(_start, loop.stepper, y0, noise)
-    given, rest = eqx.partition((loop, started), eqx.is_array)
-    loop, started = eqx.combine(jax.lax.optimization_barrier(given), rest)
-    return as_cpu_kernel(steps, loop, started)
+    first = as_cpu_kernel(_start, loop.stepper, y0)
+    given, rest = eqx.partition((loop, first), eqx.is_array)
+    loop, first = eqx.combine(jax.lax.optimization_barrier(given), rest)
+    return as_cpu_kernel(steps, loop, first)
 
 
-def _start(
-    stepper: AbstractStepper[Any, Any],
-    y0: State | Checkpoint,
-    noise: FunctionNoise | None,
-) -> tuple[RoundOff, AbstractCarry]:
-    """Return the round-off of steps and the carry before the first iteration."""
-    first = stepper.init(y0, noise)
-    return stepper.plain.round_off_at(y0, first.step_state, noise), first
+def _start(stepper: AbstractStepper[Any, Any], y0: State | Checkpoint) -> AbstractCarry:
+    """Return the carry before the first iteration."""
+    return stepper.init(y0)
 
 
-def _noise(
-    stepper: AbstractStepper[Any, Any], y0: State | Checkpoint
-) -> FunctionNoise | None:
-    """Measure the noise of the functions at a state; a checkpoint does not need it."""
+def _noise(stepper: AbstractStepper[Any, Any], y0: State | Checkpoint) -> FunctionNoise:
+    """Measure the noise of the system's functions at the start.
+
+    A checkpoint holds the noise from the first run, so that a resumed run takes the
+    same steps.
+    """
     if isinstance(y0, Checkpoint):
-        return None
+        return jax.lax.stop_gradient(FunctionNoise(*y0.round_off))
     # The noise is measured in its own kernel for two reasons. A loop over steps is
     # compiled to faster code if its kernel contains no other loop before it. In a batch
     # of runs from one state, this kernel is not batched.

@@ -28,8 +28,6 @@ from .._step import (
     ImplicitStep,
     Invariants,
     largest_violation,
-    round_off_of_steps,
-    RoundOff,
     StepArguments,
     StepOutcome,
     StepRecord,
@@ -138,17 +136,12 @@ class AbstractStepper(eqx.Module, Generic[C, R]):
         """Return the number of output rows that are filled before iteration i."""
 
     @abstractmethod
-    def with_round_off(self, round_off: RoundOff) -> "AbstractStepper[C, R]":
+    def with_noise(self, noise: FunctionNoise) -> "AbstractStepper[C, R]":
         """Return the same stepper with the measured round-off of the system."""
 
     @abstractmethod
-    def init(self, y0: State | Checkpoint, noise: FunctionNoise | None) -> C:
-        """Return the carry before the first iteration.
-
-        A start from a state needs the `noise` of the functions of the system. A start
-        from a checkpoint does not need it, because the checkpoint holds the quantities
-        that are computed from the noise.
-        """
+    def init(self, y0: State | Checkpoint) -> C:
+        """Return the carry before the first iteration."""
 
     @abstractmethod
     def advance(
@@ -240,8 +233,8 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
     - `programs`: the traced program of a step, shared by all derivatives of the run.
     - `origin`: where times and steps are counted from. The first step of the run has
         the number `origin.first_step`.
-    - `round_off`: the round-off of the functions of the system, measured at the start;
-        see `round_off_at`.
+    - `noise`: the round-off of the functions of the system, measured at the start of
+        the run, or at the start of the first run if this run resumes a checkpoint.
     """
 
     system: AbstractMechanicalSystem
@@ -252,7 +245,7 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
     args: Args
     invariants: Invariants | None
     programs: TraceCache
-    round_off: RoundOff | None
+    noise: FunctionNoise | None
     num_steps: int | IntScalar
 
     @property
@@ -275,9 +268,9 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
         del carry
         return i
 
-    def with_round_off(self, round_off: RoundOff) -> "PlainStepper":
+    def with_noise(self, noise: FunctionNoise) -> "PlainStepper":
         """Return the same stepper with the measured round-off of the system."""
-        return replace(self, round_off=round_off)
+        return replace(self, noise=noise)
 
     def time(self, k: Int[Array, ""] | IntScalar | int) -> FloatScalar:
         """Compute the time t_k as a product, since a running sum of dt would drift."""
@@ -285,7 +278,7 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
         number = (first_step + k).astype(self.dt.dtype)
         return t0 + number * self.dt + shift
 
-    def init(self, y0: State | Checkpoint, noise: FunctionNoise | None) -> PlainCarry:
+    def init(self, y0: State | Checkpoint) -> PlainCarry:
         """Return the carry before the first step.
 
         The field `result` of the carry is a failure if the run cannot start.
@@ -297,10 +290,8 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
         step_state = first_step_state(system, self.method, t, y0, args)
         if checkpoint is not None:
             step_state = resumed(checkpoint, step_state)
-            violations = RoundOff.of_arrays(checkpoint.round_off).violations
-        else:
-            assert noise is not None
-            violations = noise.violations
+        assert self.noise is not None
+        violations = self.noise.violations
         result = RESULTS.where(
             is_consistent(system, t, step_state, args, violations),
             RESULTS.successful,
@@ -331,25 +322,12 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
             stats["max_error_ratios"] = jnp.zeros((2,), violation.dtype)
         return PlainCarry(step_state, result, stats)
 
-    def round_off_at(
-        self, y0: State | Checkpoint, first: StepState, noise: FunctionNoise | None
-    ) -> RoundOff:
-        """Compute the round-off of steps from the noise of the system's functions.
-
-        A checkpoint holds the value of the first run, so that a resumed run takes the
-        same steps.
-        """
-        if isinstance(y0, Checkpoint):
-            return jax.lax.stop_gradient(RoundOff.of_arrays(y0.round_off))
-        assert noise is not None
-        return round_off_of_steps(self.method, first.lin, noise)
-
     def one_step(
         self, step_state: StepState, t: FloatScalar, h: FloatScalar, skip: BoolScalar
     ) -> StepOutcome:
         """Take one step of size h from t. A negative h integrates backwards in time."""
         start = step_state.differentiated_in_state()
-        given = self.system, t, h, start, self.args, self.invariants, self.round_off
+        given = self.system, t, h, start, self.args, self.invariants, self.noise
         arguments = StepArguments(*given)
         step = ImplicitStep(
             method=self.method,
@@ -412,13 +390,10 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
         del end, log
         return PlainReverseReplay(self, start)
 
-    def checkpoint(
-        self, round_off: RoundOff, carry: AbstractCarry, end: State
-    ) -> Checkpoint:
+    def checkpoint(self, carry: AbstractCarry, end: State) -> Checkpoint:
         """Return the checkpoint after the last step.
 
-        `end` is the last state, through which the checkpoint is differentiated, and
-        `round_off` is the value from the start of the run.
+        `end` is the last state, through which the checkpoint is differentiated.
         """
         origin, last = self.origin, carry.step_state
         return Checkpoint(
@@ -426,7 +401,7 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
             last.q_compensation,
             last.p_compensation,
             tuple(jax.tree.leaves(last.lin)),
-            tuple(jax.tree.leaves(round_off)),
+            tuple(jax.tree.leaves(self.noise)),
             origin.t0 + origin.shift,
             self.dt,
             origin.first_step + carry.stats["num_steps"],

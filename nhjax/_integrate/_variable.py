@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Int
 from .._custom_types import BoolScalar, FloatScalar, IntScalar
 from .._numerics import nan_gradient_unless, tree_where, two_sum
 from .._results import RESULTS
-from .._step import RoundOff, StepState
+from .._step import StepState
 from .._system import FunctionNoise, State
 from ._checkpoint import Checkpoint
 from ._step_sizes import (
@@ -215,15 +215,13 @@ class VariableStepper(AbstractStepper[VariableCarry, StepLogEntry]):
         del i
         return carry.stats["num_steps"]
 
-    def with_round_off(self, round_off: RoundOff) -> "VariableStepper":
+    def with_noise(self, noise: FunctionNoise) -> "VariableStepper":
         """Return the same stepper with the measured round-off of the system."""
-        return replace(self, plain=self.plain.with_round_off(round_off))
+        return replace(self, plain=self.plain.with_noise(noise))
 
-    def init(
-        self, y0: State | Checkpoint, noise: FunctionNoise | None
-    ) -> VariableCarry:
+    def init(self, y0: State | Checkpoint) -> VariableCarry:
         """Return the carry before the first attempt."""
-        carry = self.plain.init(y0, noise)
+        carry = self.plain.init(y0)
         clock, sized = self.sizes.first_clock(self.plain, y0, carry.step_state)
         result, stats = started(carry, sized, self.sizes.controller)
         return VariableCarry(carry.step_state, result, stats, clock)
@@ -335,12 +333,10 @@ class VariableStepper(AbstractStepper[VariableCarry, StepLogEntry]):
         assert log is not None
         return VariableReverseReplay(self, start, end, log)
 
-    def checkpoint(
-        self, round_off: RoundOff, carry: VariableCarry, end: State
-    ) -> Checkpoint:
+    def checkpoint(self, carry: VariableCarry, end: State) -> Checkpoint:
         """Return the checkpoint after the last accepted step."""
         clock = carry.clock
-        made = self.plain.checkpoint(round_off, carry, end)
+        made = self.plain.checkpoint(carry, end)
         return replace(
             made,
             t0=clock.t,

@@ -11,10 +11,6 @@ from ._invariants import (
 )
 from ._jacobian import ForceSlopeError as ForceSlopeError
 from ._local_error import local_error as local_error
-from ._round_off import (
-    round_off_of_steps as round_off_of_steps,
-    RoundOff as RoundOff,
-)
 from ._solvers import (
     has_default_jacobian as has_default_jacobian,
     is_simplified_alone as is_simplified_alone,

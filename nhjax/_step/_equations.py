@@ -30,6 +30,7 @@ from .._numerics import (
 from .._system import (
     AbstractMechanicalSystem,
     force_by_multiplier,
+    FunctionNoise,
     Linearisation,
     motion_residual,
     State,
@@ -39,7 +40,6 @@ from .._system import (
 from ._chart import AbstractChart, chart_of_step
 from ._invariants import InvariantCorrection, InvariantsAtStart, moving_part
 from ._redundancy import Redundancy
-from ._round_off import RoundOff
 
 
 T = TypeVar("T")
@@ -126,7 +126,7 @@ class StageEquations(eqx.Module):
     args: Args
     redundancy: Redundancy | None = None
     invariants: InvariantsAtStart | None = None
-    round_off: RoundOff | None = None
+    noise: FunctionNoise | None = None
 
     @classmethod
     def at(
@@ -139,12 +139,12 @@ class StageEquations(eqx.Module):
         args: Args,
         lin: Linearisation,
         invariants: InvariantsAtStart | None = None,
-        round_off: RoundOff | None = None,
+        noise: FunctionNoise | None = None,
     ) -> "StageEquations":
         """Build the equations of a step of size h from the state y at t."""
         system, q = with_frames(system, y.q)
         given = t, h, q, y.p, y.multiplier, args
-        stages = cls(system, method, *given, invariants=invariants, round_off=round_off)
+        stages = cls(system, method, *given, invariants=invariants, noise=noise)
         if system.constraints != "redundant" or not stages.constrained:
             return stages
         redundancy = Redundancy.at(lin, stages.num_nonholonomic)

@@ -2,50 +2,13 @@
 
 import functools
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from .._custom_types import FloatScalar
 from .._method import AbstractMethod
 from .._numerics import max_norm, stop_gradient
 from .._system import FunctionNoise, Linearisation
-
-
-class RoundOff(eqx.Module):
-    """The round-off of the functions of a system, as sizes of fibre coordinates.
-
-    A size is the fraction `PART` of a round-off, divided by the unit round-off, so that
-    it is comparable to the size of the coordinates. The round-off is measured once, at
-    the start of a run, because constants inside the functions do not change. Each step
-    adds the sizes of its own coordinates. The size in a step of length h is
-
-    `by_velocity` + h `by_force` + `by_position` / h.
-
-    - `by_velocity`: from momenta and constraints on velocities.
-    - `by_force`: from forces.
-    - `by_position`: from holonomic constraints.
-    - `violations`: the violations of the constraints on velocities and on positions
-        that round-off can cause, in the units of the constraints.
-    """
-
-    by_velocity: FloatScalar
-    by_force: FloatScalar
-    by_position: FloatScalar
-    violations: tuple[Float[Array, " l"], Float[Array, " k"]]
-
-    @classmethod
-    def of_arrays(cls, arrays: tuple[Array, ...]) -> "RoundOff":
-        """Build an instance from its arrays, in the order of the fields."""
-        by_velocity, by_force, by_position, *violations = arrays
-        on_velocities, on_positions = violations
-        sizes = by_velocity, by_force, by_position
-        return cls(*sizes, (on_velocities, on_positions))
-
-    def size(self, h: FloatScalar) -> FloatScalar:
-        """Compute the size in a step of length h > 0."""
-        return self.by_velocity + h * self.by_force + self.by_position / h
 
 
 # When the increments of the stages stop falling, they can be six times as large as the
@@ -55,32 +18,37 @@ class RoundOff(eqx.Module):
 PART = 1 / 8
 
 
-def round_off_of_steps(
-    method: AbstractMethod, lin: Linearisation, noise: FunctionNoise
-) -> RoundOff:
-    """Compute the round-off of steps from the noise of the functions of a system.
+def noise_of_step(
+    method: AbstractMethod, lin: Linearisation, noise: FunctionNoise, h: FloatScalar
+) -> FloatScalar:
+    """Compute the change of fibre coordinates by the round-off of a system's functions.
 
-    `lin` is the linearisation at the state at which the noise was measured. The inverse
-    of the matrix of the method's coefficients magnifies the round-off of constraints.
+    The round-off of the functions is measured once, at the start of a run, because
+    constants inside the functions do not change. Its effect on the fibre coordinates
+    can change by orders of magnitude, for instance where constraints become dependent.
+    Therefore each step computes the effect with its own matrices,
+
+    |M⁻¹| (δp + |h| δf) + |N⁻¹ R| (c δφ + ĉ δΓ / |h|),
+
+    with the round-off δp of momenta, δf of forces, δφ of constraints on velocities and
+    δΓ of holonomic constraints. The factors c and ĉ are `magnifications`.
+
+    **Arguments:** `method`; `lin`, the linearisation at the start of the step; `noise`,
+    the round-off of the functions; `h`, the step size.
     """
-    lin = stop_gradient(lin)
-    inverse = lin.momentum_inverse.absolute()
-    by_velocity, by_force = (
-        max_norm(inverse.matvec(x)) for x in (noise.momentum, noise.force)
-    )
-    by_position = jnp.zeros_like(by_velocity)
+    lin, h = stop_gradient(lin), jnp.abs(stop_gradient(h))
+    gained = noise.momentum + h * noise.force
+    changes = max_norm(lin.momentum_inverse.absolute().matvec(gained))
     if lin.violation.shape[0]:
         kinematic, holonomic = magnifications(method)
-        correction = lin.largest_correction(noise.on_velocities)
-        by_velocity = by_velocity + kinematic * correction
+        missed = kinematic * noise.on_velocities
         k = noise.on_positions.shape[0]
         if k:
             m = lin.violation.shape[0] - k
-            sizes = jnp.pad(noise.on_positions, (m, 0))
-            by_position = holonomic * lin.largest_correction(sizes)
-    units = PART / float(jnp.finfo(by_velocity.dtype).eps)
-    sizes = units * by_velocity, units * by_force, units * by_position
-    return RoundOff(*sizes, noise.violations)
+            on_positions = holonomic / h * noise.on_positions
+            missed = jnp.concatenate([missed[:m], missed[m:] + on_positions])
+        changes = changes + lin.largest_correction(missed)
+    return changes
 
 
 @functools.lru_cache

@@ -50,7 +50,7 @@ from ._jacobian import (
     simplified_newton_update,
     update_norms,
 )
-from ._round_off import PART
+from ._round_off import noise_of_step, PART
 from ._step import AbstractStageSolver, FrozenNewtonMap
 
 
@@ -451,8 +451,8 @@ def fibre_coordinate_scale(
         grown large, such as the heading of a car after many turns.
     - The round-off of invariants, through the impulses that keep them.
 
-    The additional round-off is at least the measured round-off of the functions of the
-    system.
+    The additional round-off is at least `PART` of the measured round-off of the
+    functions of the system.
     """
     h = jnp.abs(stages.h)
     rate = max_norm(lin.acceleration)
@@ -475,9 +475,10 @@ def fibre_coordinate_scale(
     if stages.invariants is not None:
         round_off = round_off + invariant_correction(stages, x0).noise
     noise = jnp.zeros_like(size)
-    if stages.round_off is not None:
-        measured = stages.round_off.size(h)
-        round_off, noise = jnp.maximum(round_off, measured), measured / PART
+    if stages.noise is not None:
+        eps = float(jnp.finfo(size.dtype).eps)
+        noise = noise_of_step(stages.method, lin, stages.noise, h) / eps
+        round_off = jnp.maximum(round_off, PART * noise)
     return Scale(size, round_off, noise)
 
 

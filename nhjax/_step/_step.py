@@ -40,6 +40,7 @@ from .._results import RESULTS
 from .._system import (
     AbstractMechanicalSystem,
     all_finite,
+    FunctionNoise,
     keeps_constraints,
     Linearisation,
     linearise,
@@ -58,7 +59,7 @@ from ._equations import (
     unknown_units,
 )
 from ._invariants import Invariants, InvariantsAtStart
-from ._round_off import RoundOff
+from ._round_off import noise_of_step, PART
 
 
 class StepState(eqx.Module):
@@ -95,8 +96,8 @@ class StepArguments(eqx.Module):
 
     In `step_state` only the state has derivatives; see
     `StepState.differentiated_in_state`. If `invariants` is None, the step keeps no
-    invariants. If `round_off` is None, round-off is estimated from the sizes of the
-    unknowns.
+    invariants. `noise` is the round-off of the functions of the system; if it is None,
+    round-off is estimated from the sizes of the unknowns.
     """
 
     system: AbstractMechanicalSystem
@@ -105,7 +106,7 @@ class StepArguments(eqx.Module):
     step_state: StepState
     args: Args
     invariants: Invariants | None = None
-    round_off: RoundOff | None = None
+    noise: FunctionNoise | None = None
 
 
 class StepRecord(eqx.Module):
@@ -295,7 +296,7 @@ def step(
     result = _result(solved, lin, next_state, is_in_chart(stages, x))
     if stages.redundancy is not None:
         small = float(jnp.finfo(p.dtype).eps) ** 0.5 + 100 * stage_solver.tolerance
-        allowed = None if stages.round_off is None else stages.round_off.violations
+        allowed = None if stages.noise is None else stages.noise.violations
         holds = keeps_constraints(system, lin_next, t + h, end, args, small, allowed)
         lost = (result == RESULTS.successful) & ~holds
         result = RESULTS.where(lost, RESULTS.lost_constraints, result)
@@ -329,7 +330,7 @@ def equations_of_step(
         invariants = InvariantsAtStart.at(
             arguments.invariants, system, t, y, position, args, lin
         )
-    given = t, arguments.h, y, args, lin, invariants, arguments.round_off
+    given = t, arguments.h, y, args, lin, invariants, arguments.noise
     return StageEquations.at(system, method, *given)
 
 
@@ -509,10 +510,11 @@ def error_ratios(
 
     # The divisor is increased by the round-off of u, because a difference of this size
     # contains no information about the error.
-    size = max_norm(u)
-    if stages.round_off is not None:
-        size = jnp.maximum(size, stages.round_off.size(jnp.abs(h)))
-    floor = NOISE_UNITS * float(jnp.finfo(u.dtype).eps) * size
+    round_off = float(jnp.finfo(u.dtype).eps) * max_norm(u)
+    if stages.noise is not None:
+        noise = noise_of_step(stages.method, lin, stages.noise, h)
+        round_off = jnp.maximum(round_off, PART * noise)
+    floor = NOISE_UNITS * round_off
     whole = max_norm(*change(stages.coefficients("b"))) + floor
     moved, gained = change(jnp.asarray(difference, u.dtype))
     if stages.constrained:

@@ -96,3 +96,23 @@ def test_iteration_with_large_data_ends_at_their_round_off_and_keeps_tolerance(
     )
     assert solved.converged
     assert int(solved.num_iterations) == iterations
+
+
+@pytest.mark.parametrize("is_measured", [True, False])
+def test_slow_iteration_with_measured_noise_ends(is_measured):
+    eps, noise = np.finfo(float).eps, 1e-11
+
+    def sweep(k):
+        fluctuation = noise * (10 + 4 * jnp.sin(k))
+        return k + 1, UpdateNorms(jnp.maximum(0.98**k, fluctuation)), None
+
+    solved = iterate(
+        sweep,
+        jnp.asarray(0.0),
+        jnp.asarray(1.0),
+        max_iterations=2000,
+        noise=noise / eps if is_measured else 0.0,
+        noise_units=400,
+    )
+    assert solved.converged == is_measured
+    assert solved.exhausted != is_measured

@@ -431,8 +431,8 @@ def _reset(
     y = with_continuous_multiplier(system, method, t, step_state.state, args)
     y = with_continuous_multiplier(system, method, t, reset(t, y, args), args)
     after = first_step_state(system, method, t, y, args)
-    assert stepper.round_off is not None
-    violations = stepper.round_off.violations
+    assert stepper.noise is not None
+    violations = stepper.noise.violations
     return after, all_finite(y) & is_consistent(system, t, after, args, violations)
 
 

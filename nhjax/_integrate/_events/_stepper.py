@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..._custom_types import BoolScalar, FloatScalar, IntScalar
 from ..._numerics import nan_gradient_unless, tree_where, two_sum
 from ..._results import RESULTS
-from ..._step import first_step_state, ImplicitStep, RoundOff, StepArguments, StepState
+from ..._step import first_step_state, ImplicitStep, StepArguments, StepState
 from ..._system import FunctionNoise, State
 from .._checkpoint import Checkpoint
 from .._solution import EventLog
@@ -246,9 +246,9 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         del i
         return carry.place.row
 
-    def with_round_off(self, round_off: RoundOff) -> "EventStepper":
+    def with_noise(self, noise: FunctionNoise) -> "EventStepper":
         """Return the same stepper with the measured round-off of the system."""
-        return replace(self, plain=self.plain.with_round_off(round_off))
+        return replace(self, plain=self.plain.with_noise(noise))
 
     def progress(self, carry: EventCarry) -> Any:
         """Compute the part of the run that is done, from 0 to 1, if steps differ."""
@@ -262,9 +262,9 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
             return place.clock.t + place.offset
         return self.plain.time(place.node) + place.offset
 
-    def init(self, y0: State | Checkpoint, noise: FunctionNoise | None) -> EventCarry:
+    def init(self, y0: State | Checkpoint) -> EventCarry:
         """Return the carry before the first iteration."""
-        carry = self.plain.init(y0, noise)
+        carry = self.plain.init(y0)
         t = self.plain.time(0)
         signs, known = signs_at(self.conditions, self.plain, t, carry.step_state)
         unknown = (carry.result == RESULTS.successful) & ~known
@@ -523,7 +523,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         """Take a step of size h from t, truncated at its first event if it has one."""
         plain, place = self.plain, carry.place
         start = carry.step_state.differentiated_in_state()
-        given = plain.args, plain.invariants, plain.round_off
+        given = plain.args, plain.invariants, plain.noise
         arguments = StepArguments(plain.system, t, h, start, *given)
         # The type checker sees the property `programs` as a field.
         step = ImplicitTruncatedStep(  # pyright: ignore[reportCallIssue]
