@@ -11,7 +11,8 @@ compiled residuals and Jacobians.
 
 The error is the largest error of (q, v) at the end, relative to the size of the state.
 The reference is a run with s = 6 and the tolerance 1e-12. The number of steps includes
-rejected steps. Times are the least of three calls of compiled programs. For the
+rejected steps. Times are the least of three calls of programs that are compiled by
+`jax.jit`, except those of IDA. For the
 comparison at equal error, the steps of a ladder (the runs of one method with different
 steps or tolerances) are interpolated in logarithms.
 
@@ -29,6 +30,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -210,22 +212,42 @@ def reference(case: Case) -> np.ndarray:
     return end_of(sol)
 
 
-def measure(name: str, case: Case) -> Iterator[Row]:
-    """Run a case with all steps of all ladders."""
-    exact, method = reference(case), nhjax.LobattoIIIAB(case.stages)
+def compiled_run(case: Case, stages: int) -> Callable[[dict[str, Any]], nhjax.Solution]:
+    """Return a compiled function from the options of a run to its solution.
 
-    def run(**options: Any) -> nhjax.Solution:
+    The function is compiled once for all values of arrays in the options.
+    """
+
+    @eqx.filter_jit
+    def run(start: nhjax.State, options: dict[str, Any]) -> nhjax.Solution:
         return nhjax.integrate(
             case.system,
-            method,
-            case.start,
+            nhjax.LobattoIIIAB(stages),
+            start,
             throw=False,
             stage_solver=nhjax.SimplifiedNewton(fallback=False),
             **options,
         )
 
+    return lambda options: run(case.start, options)
+
+
+def pid_controller(rtol: float, atol: float) -> nhjax.PIDController:
+    """Create a controller whose tolerances are arrays."""
+    return nhjax.PIDController(jnp.asarray(rtol), jnp.asarray(atol))
+
+
+def to_end(case: Case, controller: Any) -> dict[str, Any]:
+    """Return the options of a run to the end of a motion."""
+    return {"t1": case.t1, "stepsize_controller": controller, "max_steps": 10**6}
+
+
+def measure(name: str, case: Case) -> Iterator[Row]:
+    """Run a case with all steps of all ladders."""
+    exact, run = reference(case), compiled_run(case, case.stages)
+
     def row(kind: str, setting: float, **options: Any) -> Row:
-        sol, seconds = timed(lambda: run(**options))
+        sol, seconds = timed(lambda: run(options))
         rejected = int(sol.stats.get("num_rejected_steps", 0))
         steps = int(sol.stats["num_steps"]) + rejected
         error = np.max(np.abs(end_of(sol) - exact)) / np.max(np.abs(exact))
@@ -233,24 +255,13 @@ def measure(name: str, case: Case) -> Iterator[Row]:
         return Row(name, kind, setting, float(error), steps, rejected, seconds)
 
     for count in case.constant:
-        yield row("constant", count, dt=case.t1 / count, num_steps=count)
+        size = jnp.asarray(case.t1 / count)
+        yield row("constant", count, dt=size, num_steps=jnp.asarray(count))
     for rtol in TOLERANCES:
-        yield row(
-            "PID",
-            rtol,
-            t1=case.t1,
-            stepsize_controller=nhjax.PIDController(rtol, 1e-2 * rtol),
-            max_steps=10**6,
-        )
+        yield row("PID", rtol, **to_end(case, pid_controller(rtol, 1e-2 * rtol)))
     for eps in case.eps:
-        controller = nhjax.ReversibleController(eps, case.density)
-        yield row(
-            "reversible",
-            eps,
-            t1=case.t1,
-            stepsize_controller=controller,
-            max_steps=10**6,
-        )
+        controller = nhjax.ReversibleController(jnp.asarray(eps), case.density)
+        yield row("reversible", eps, **to_end(case, controller))
     if case.system.manifold is None:
         yield from of_diffrax(name, case, exact)
         yield from of_ida(name, case, exact)
@@ -530,7 +541,10 @@ def measure_stages() -> tuple[str, dict[str, Any]]:
         case = CASES[name]()
         exact, of = reference(case), {}
         for stages in range(2, 9):
-            of[stages] = [stage_row(name, case, exact, stages, k) for k in range(2, 13)]
+            run = compiled_run(case, stages)
+            of[stages] = [
+                stage_row(name, case, exact, stages, k, run) for k in range(2, 13)
+            ]
             shown = [x for x in of[stages] if x.setting in SHOWN]
             ratios = [f"{x.error / x.setting:.2g}" for x in shown]
             factors.append([name, str(stages), *ratios])
@@ -548,24 +562,17 @@ def measure_stages() -> tuple[str, dict[str, Any]]:
 
 
 def stage_row(
-    name: str, case: Case, exact: np.ndarray, stages: int, digits: int
+    name: str,
+    case: Case,
+    exact: np.ndarray,
+    stages: int,
+    digits: int,
+    run: Callable[[dict[str, Any]], nhjax.Solution],
 ) -> Row:
     """Run a case with a number of stages and the tolerance 10^-digits."""
     rtol = 10.0**-digits
-
-    def call() -> nhjax.Solution:
-        return nhjax.integrate(
-            case.system,
-            nhjax.LobattoIIIAB(stages),
-            case.start,
-            t1=case.t1,
-            stepsize_controller=nhjax.PIDController(rtol, rtol),
-            max_steps=10**5,
-            throw=False,
-            stage_solver=nhjax.SimplifiedNewton(fallback=False),
-        )
-
-    sol, seconds = timed(call)
+    options = to_end(case, pid_controller(rtol, rtol))
+    sol, seconds = timed(lambda: run(options))
     error = np.max(np.abs(end_of(sol) - exact)) / np.max(np.abs(exact))
     steps, rejected = sol.stats["num_steps"], sol.stats["num_rejected_steps"]
     given = float(error), int(steps), int(rejected), seconds
@@ -600,7 +607,8 @@ def measure_tolerances() -> tuple[str, dict[str, Any]]:
         exact, line = reference(case), []
         for digits in (4, 6, 8, 10):
             stages = nhjax.LobattoIIIAB.for_tolerance(10.0**-digits).stages
-            row = stage_row(name, case, exact, stages, digits)
+            run = compiled_run(case, stages)
+            row = stage_row(name, case, exact, stages, digits, run)
             line.append(row.error / row.setting)
             print(row, flush=True)
         marker = "o-" if k < 10 else "s-"  # The colours repeat after ten lines.

@@ -3,7 +3,7 @@
 A contact is given by the pose of a body: its position x(t, q) in space and its rotation
 R(t, q). The point c that touches the ground follows from the shape of the body. The
 height of c above the ground is the holonomic constraint. The nonholonomic constraints
-are the components along the ground of the velocity
+are the tangential components (along the ground) of the velocity
 
     u = ẋ + Ṙ Rᵀ (c - x) - w
 

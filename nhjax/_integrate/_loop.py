@@ -8,7 +8,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import equinox as eqx
 import jax
@@ -137,8 +137,11 @@ class AbstractAdjoint(eqx.Module):
     """The way in which `integrate` is differentiated in reverse mode.
 
     An adjoint decides which data of the steps are stored for the reverse pass, and
-    which are computed again.
+    which are computed again. If it `needs_log`, a run whose steps differ saves the
+    start and the size of each step.
     """
+
+    needs_log: eqx.AbstractClassVar[bool]
 
     @abstractmethod
     def run(self, loop: Loop, carry: AbstractCarry) -> _Run:
@@ -202,6 +205,8 @@ class DirectAdjoint(AbstractAdjoint):
         7.0
     """
 
+    needs_log: ClassVar[bool] = False
+
     def run(self, loop: Loop, carry: AbstractCarry) -> _Run:
         """Run all steps of the loop from `carry`; return its end and all saved rows."""
         state = (carry, loop.empty_rows(carry))
@@ -214,11 +219,11 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
     """Store some states on the way, recompute the rest: memory O(sqrt(num_steps)).
 
     The steps are divided into `checkpoints` blocks, and each block again, until a block
-    has at most `checkpoints` steps. The reverse pass works in one block of each
-    level at a time. It stores the states at the starts of the smaller blocks inside,
-    and the stages of the current block in the last level. The default is two
-    levels. Each level beyond the first costs another forward run. With L levels and
-    num_steps = checkpoints^L the memory is O(L checkpoints).
+    has at most `checkpoints` steps. The reverse pass works in one block of each level
+    at a time. For this block it stores the states at the starts of the blocks of the
+    next level. In a block of the last level, it stores the stages of all steps. The
+    default is two levels. Each level beyond the first costs another forward run. With L
+    levels and num_steps = checkpoints^L the memory is O(L checkpoints).
 
     Forward mode, second derivatives and an array `num_steps` work as with
     `DirectAdjoint`.
@@ -250,6 +255,7 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
     """
 
     checkpoints: int | None = eqx.field(static=True, default=None)
+    needs_log: ClassVar[bool] = False
 
     def __check_init__(self):
         number = self.checkpoints

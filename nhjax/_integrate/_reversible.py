@@ -1,7 +1,7 @@
 """The reversible adjoint: the backward pass retraces the run from its end."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -44,6 +44,8 @@ class ReversibleAdjoint(AbstractAdjoint):
         >>> round(float(jax.grad(end)(0.1)), 6)
         7.0
     """
+
+    needs_log: ClassVar[bool] = True
 
     def run(self, loop: Loop, carry: AbstractCarry) -> tuple[AbstractCarry, Rows]:
         """Run all steps of the loop from `carry`; return its end and all saved rows."""

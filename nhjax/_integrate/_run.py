@@ -138,6 +138,9 @@ def run(
     given = system, method, y0, grid, args, options, solver_options.stage_solver
     stepper, fn = _stepper(*given)
     stepper = stepper.with_noise(_noise(stepper, y0))
+    adjoint = solver_options.adjoint
+    if isinstance(stepper, VariableStepper):
+        stepper = replace(stepper, keeps_log=adjoint.needs_log)
     plain = stepper.plain
     system, most = plain.system, plain.num_steps
     is_variable, sampled = isinstance(grid, VariableGrid), None
@@ -149,13 +152,12 @@ def run(
     places = record_places(keeps_all, sampled, most)
     saving = Saving.of(saveat, fn, most, places, stepper.log_length)
     loop = Loop(stepper, saving, solver_options.meter)
-    adjoint = solver_options.adjoint
     start, carry, rows = _all_steps(adjoint, loop, y0, saveat.checkpoint)
     given = (system, y0, t0, grid, args), options.events, options.controller
     end = loop.stepper.finish(carry, (rows.saved, rows.record), rows.log, given)
     # The number of filled rows includes a row for an event that ends the run.
     zero = jnp.zeros((), jnp.int32)
-    number = stepper.num_filled(carry, zero) if is_variable else None
+    number = loop.stepper.num_filled(carry, zero) if is_variable else None
     if number is None:
         ts, ys = _output(saveat, loop, t0, start, end, sampled)
     else:
@@ -458,7 +460,8 @@ def run_in_chunks(
     if not isinstance(grid, VariableGrid):
         steps = _sampled_steps(saveat, grid)
     keeps_records = saveat.dense or saveat.ts is not None
-    # Each chunk gets the number of steps in its `Span`, so that the grid needs none.
+    # Each chunk reads the number of steps of the run from its `Span`, so that the grid
+    # does not need this number.
     whole, grid = grid, grid.of_length(None)
     given = system, method, y0, grid, args, options, solver_options.stage_solver
     captured = captured_by(system, args, options)

@@ -189,10 +189,15 @@ class StepLogEntry(eqx.Module):
 
 
 class VariableStepper(AbstractStepper[VariableCarry, StepLogEntry]):
-    """One attempt at a step per iteration. `plain` takes the single steps."""
+    """One attempt at a step per iteration. `plain` takes the single steps.
+
+    If `keeps_log`, the run saves the start and the size of each step, for the
+    reversible adjoint.
+    """
 
     plain: PlainStepper
     sizes: StepSizes
+    keeps_log: bool = eqx.field(static=True, default=False)
 
     @property
     def num_iterations(self) -> int | IntScalar:
@@ -206,9 +211,12 @@ class VariableStepper(AbstractStepper[VariableCarry, StepLogEntry]):
 
     @property
     def log_length(self) -> int:
-        """Return the largest number of steps, or 0 if it is not known when tracing."""
+        """Return the largest number of steps, or 0 without a log.
+
+        There is no log if this number is not known when tracing.
+        """
         number = self.plain.num_steps
-        return number if isinstance(number, int) else 0
+        return number if self.keeps_log and isinstance(number, int) else 0
 
     def num_filled(self, carry: VariableCarry, i: Int[Array, ""]) -> Int[Array, ""]:
         """Return the number of accepted steps."""

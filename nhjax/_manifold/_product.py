@@ -121,13 +121,13 @@ class ProductGroup(AbstractLieGroup):
     def advance(
         self, q: Element, xi: Vector, compensation: Element
     ) -> tuple[Element, Element]:
-        """Advance the part of every factor, with its own compensation."""
+        """Advance each factor's part of q, with its own compensation."""
         return self._pair(lambda group, *of: group.advance(*of), q, xi, compensation)
 
     def advance_across(
         self, q: Element, xi: Vector, compensation: Element
     ) -> tuple[Element, Element]:
-        """Advance the part of every factor from -ξ to ξ in its chart."""
+        """Advance each factor's part of q from -ξ to ξ in the chart of this factor."""
         return self._pair(
             lambda group, *of: group.advance_across(*of), q, xi, compensation
         )

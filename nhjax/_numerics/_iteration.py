@@ -35,8 +35,8 @@ _LARGEST_NOISE = 1e5
 # After more than this many iterations, an iteration counts as slow.
 _SLOW = 100
 # The last increment of a slow iteration is treated as noise up to this many units of
-# the measured noise. Near positions at which constraints become dependent, increments were
-# seen that vary between 5 and 19 units and do not fall further.
+# the measured noise. Near positions at which constraints become dependent, increments
+# were seen that vary between 5 and 19 units and do not fall further.
 _LAST_UNITS = 32.0
 
 

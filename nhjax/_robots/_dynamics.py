@@ -215,7 +215,8 @@ def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
         inertia, moment = total.tolist(), total_moment.tolist()
         masses = args.get("mass", {})
         for i in changed:
-            # A body with another mass has the same shape and centre of mass.
+            # If the mass of a body changes, its shape and its centre of mass stay the
+            # same, and its inertia is multiplied by the same factor.
             factor, name = 1.0, changing_mass.get(i)
             if name in masses:
                 factor = entries.times(masses[name], float(1 / bodies.mass[i]))

@@ -697,10 +697,11 @@ def stage_residuals(
 def stage_residual(
     stages: StageEquations, x: StageUnknowns
 ) -> tuple[Float[Array, " k"], Evaluation]:
-    """Evaluate all equations of a step (the paper's four summaries) in one vector.
+    """Evaluate all equations of a step in one vector.
 
-    Your own stage solver looks for the stages at which the vector vanishes; see the
-    page on extending in the documentation.
+    The paper lists these equations in its four summaries. Your own stage solver looks
+    for the stages at which the vector vanishes; see the page on extending in the
+    documentation.
 
     **Arguments:**
 

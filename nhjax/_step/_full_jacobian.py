@@ -457,9 +457,10 @@ def _end_impulse_slopes(stages: StageEquations, x: StageUnknowns) -> tuple[Array
 class ConstraintSlopes(eqx.Module):
     """The derivatives of all constraints at the nodes i >= 2 of given stages.
 
-    A node is at the position that the increments Ξ_i = h Σ a_ij H_j and ξ reach, with
-    the fibre coordinate u_i. `values` are the constraints on velocities, including the
-    rates of holonomic constraints, and `positions` are the holonomic constraints.
+    The increments Ξ_i = h Σ a_ij H_j and ξ = h Σ b_j H_j determine the position of node
+    i, and u_i is its fibre coordinate. `values` are the constraints on velocities,
+    including the rates of holonomic constraints, and `positions` are the holonomic
+    constraints.
     """
 
     values: tuple[Float[Array, "r l n"], ...]  # with respect to Ξ_i, ξ and u_i

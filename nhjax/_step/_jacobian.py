@@ -347,9 +347,10 @@ class StageJacobianFactors(eqx.Module):
     The constraints require B_i δu_i = -r_Φ at the nodes, Σ_j a_ij B_i δu_j = -r_Γ at
     the positions, and B_s δu_s = -r for the rate of the holonomic constraints at the
     end of the step. These three conditions give a Schur complement for the unknowns
-    h δy of the closure and h δΛ of the holonomic constraints. For small h it is
-    invertible by hypothesis H2 and the compatibility condition, for the symmetric
-    closure also by the sign of its unknown ν; see `docs/closures.md`.
+    h δy of the closure and h δΛ of the holonomic constraints. For small h this matrix
+    is invertible by hypothesis H2 and the compatibility condition. For the symmetric
+    closure, the sign with which its unknown ν enters the last multiplier matters too;
+    see `docs/closures.md`.
 
     With `first_order`, the terms of order h are added to N⁻¹ r. The changes of the
     unknowns with the multipliers are then the `responses`, which include these terms.

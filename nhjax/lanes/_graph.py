@@ -690,9 +690,9 @@ class BranchBuilder:
 # in a copy.
 #
 # A copy shares its common subexpressions with its surroundings, and its invariant
-# operations are hoisted out of loops. Therefore programs are still written out in
-# loops, except in a loop that contains another loop of unknown length, such as the loop
-# over the steps of a run.
+# operations are hoisted out of loops. Therefore programs inside a loop are still copied
+# (written out), unless this loop contains another loop of unknown length. For example,
+# the loop over the steps of a run contains the iterations of the stage solver.
 #
 # A function is a region of its own, in which `parameter` nodes stand for the arguments.
 # A node `call` stands for all results, and a node `part` for one of them. Both are

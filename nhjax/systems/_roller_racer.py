@@ -27,11 +27,11 @@ class RollerRacer(AbstractGaitMachine):
     L = m₁/2 |ṙ₁|² + I₁/2 θ̇² + m₂/2 |ṙ₂|² + I₂/2 (θ̇ + φ̇)²,
     Φ = (n₁ · ṙ₁, n₂ · ṙ₂),  r₂ = r₁ + d₁ e(θ) + d₂ e(θ + φ),
 
-    with q = (x, y, θ, φ): the axle r₁ [m] and the heading θ [rad] of the seat, and the
-    angle φ of the handlebar relative to the seat [rad]; e is the unit vector at an
-    angle, and n₁, n₂ are the unit vectors across the two bodies. The centres of mass
-    lie at the axles, d₁ behind and d₂ ahead of the pivot. Where d₁ cos φ + d₂ = 0 the
-    constraints do not determine the turning rate.
+    with q = (x, y, θ, φ): the position r₁ = (x, y) [m] of the axle of the seat, the
+    heading θ [rad] of the seat, and the angle φ [rad] of the handlebar relative to the
+    seat; e(α) is the unit vector at the angle α, and n₁, n₂ are the unit vectors across
+    the two bodies. The centres of mass lie at the axles, d₁ behind and d₂ ahead of the
+    pivot. Where d₁ cos φ + d₂ = 0 the constraints do not determine the turning rate.
 
     A `gait` prescribes φ by the holonomic constraint Γ = φ - gait(t). With `gait=None`
     the pivot moves freely under the torque [N m] in `args`, a scalar or `None`. The

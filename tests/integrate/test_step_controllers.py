@@ -157,6 +157,15 @@ def test_pid_counts_each_attempt():
         swing(t1=9.0, max_steps=attempts - 1)
 
 
+@pytest.mark.parametrize("adjoint", [DirectAdjoint(), RecursiveCheckpointAdjoint()])
+def test_run_that_saves_its_end_needs_no_memory_for_max_steps(adjoint):
+    def end(y0):
+        return swing(y0=y0, t1=9.0, max_steps=10**6, adjoint=adjoint).ys.q
+
+    compiled = jax.jit(end).lower(SWINGING).compile()
+    assert compiled.memory_analysis().temp_size_in_bytes < 10**5
+
+
 def test_pid_rejects_few_steps_of_a_smooth_motion():
     sol = swing(PID, SLIDING, SLIDE, t1=20.0)
     share = int(sol.stats["num_rejected_steps"]) / attempts_of(sol)
