@@ -81,7 +81,7 @@ class Scene:
     def _places(self, who: str, subject: Subject, q: Any) -> tuple[Any, Any, Any]:
         """Return qpos, the poses of the bodies, and the model without additions.
 
-        For a robot the poses are None, and for a `Looks` qpos is None.
+        For a robot, the poses are None; for a `Looks`, qpos is None.
         """
         mujoco, spec = self._mujoco, subject.spec
         if subject.robot is not None:

@@ -173,7 +173,7 @@ class AbstractMethod(eqx.Module):
         CĈ(Q), minus one if R_A(∞) = 1, then rounded up to an even number if the method
         is symmetric, and at most `constrained_order`. Runs of many tableaux show this
         rule. (The paper's theorem on global convergence has q in place of the smaller
-        of q and Q; they are equal for Lobatto nodes only.) With the other closures the
+        of q and Q, which is the same for Lobatto's nodes.) With the other closures the
         multiplier is the continuous multiplier, which has the order of the state.
 
         **Raises:** `ValueError`, as `require_constraint_hypotheses` does.

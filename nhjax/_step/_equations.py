@@ -345,7 +345,7 @@ def forces_by_multiplier(
 def momenta_of_forces(
     stages: StageEquations, x: StageUnknowns, forces: Float[Array, "s n c"]
 ) -> tuple[Float[Array, "s n c"], Float[Array, "r n c"]]:
-    """Compute the momenta of stages and nodes from forces at the stages, for h = 1.
+    """Compute momenta / h of stages and nodes that are due to forces at the stages.
 
     The chart transports forces from stage to stage, which adds a term of order h.
     """

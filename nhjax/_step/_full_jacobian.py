@@ -157,7 +157,7 @@ class LinearisedStep(eqx.Module):
         x: StageUnknowns,
         reaction: Float[Array, "s n"],
     ) -> StageResponses:
-        """Compute the changes of stages and nodes due to given reactions, for h = 1."""
+        """Compute the changes / h of stages and nodes due to given reactions."""
         on_stages, on_nodes = momenta_of_forces(stages, x, reaction[..., None])
         on_stages, on_nodes = on_stages[..., 0], on_nodes[..., 0]
         velocity, momentum = self.of_stages(stages, on_stages)

@@ -155,7 +155,8 @@ class FullFactors(eqx.Module):
     ) -> StageUnknowns:
         """Change the multipliers so that the linearised constraints hold.
 
-        With the symmetric closure, this includes the equations of motion at the end.
+        With the symmetric closure, the linearised equations of motion at the end of the
+        step then hold too.
         """
         if self.responses is None:
             return x

@@ -115,7 +115,7 @@ def _programs(params: Any) -> Iterator[Any]:
 
 
 def rms_array_size(program: Any, per_loop: int = 1) -> float:
-    """Return the root mean square of the sizes of arrays in arithmetic.
+    """Return the root mean square size of the results of arithmetic operations.
 
     An operation inside a loop counts `per_loop` times as much as an operation outside
     of the loop.
