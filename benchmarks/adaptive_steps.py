@@ -6,13 +6,12 @@ constraint, a whip of ten pendulums, and a bicycle that falls. Three other motio
 smooth, so that constant steps suit them. Each motion is run with constant steps, with
 the PID controller, and with the reversible controller. If the equations are on a vector
 space, two other solvers run them too: diffrax with its PID controller on the
-index-reduced equations, and IDA of SUNDIALS on the equations with multipliers, with
-compiled residuals and Jacobians.
+index-reduced equations, and IDA of SUNDIALS on the equations with multipliers.
 
 The error is the largest error of (q, v) at the end, relative to the size of the state.
 The reference is a run with s = 6 and the tolerance 1e-12. The number of steps includes
-rejected steps. Times are the least of three calls of programs that are compiled by
-`jax.jit`, except those of IDA. For the
+rejected steps. Times are the least of three calls. All programs are compiled by
+`jax.jit`, except the loop of IDA, which calls compiled residuals and Jacobians. For the
 comparison at equal error, the steps of a ladder (the runs of one method with different
 steps or tolerances) are interpolated in logarithms.
 

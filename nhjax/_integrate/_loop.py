@@ -137,8 +137,8 @@ class AbstractAdjoint(eqx.Module):
     """The way in which `integrate` is differentiated in reverse mode.
 
     An adjoint decides which data of the steps are stored for the reverse pass, and
-    which are computed again. If it `needs_log`, a run whose steps differ saves the
-    start and the size of each step.
+    which are computed again. If it `needs_log`, a run with a step size controller and
+    without events saves the start and the size of each step.
     """
 
     needs_log: eqx.AbstractClassVar[bool]

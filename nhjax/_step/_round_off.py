@@ -7,7 +7,7 @@ import numpy as np
 
 from .._custom_types import FloatScalar
 from .._method import AbstractMethod
-from .._numerics import max_norm, stop_gradient
+from .._numerics import max_norm, nonzero_or_one, stop_gradient
 from .._system import FunctionNoise, Linearisation
 
 
@@ -21,7 +21,7 @@ PART = 1 / 8
 def noise_of_step(
     method: AbstractMethod, lin: Linearisation, noise: FunctionNoise, h: FloatScalar
 ) -> FloatScalar:
-    """Compute the change of fibre coordinates by the round-off of a system's functions.
+    """Estimate the change of fibre coordinates by the round-off of the functions.
 
     The round-off of the functions is measured once, at the start of a run, because
     constants inside the functions do not change. Its effect on the fibre coordinates
@@ -34,9 +34,11 @@ def noise_of_step(
     δΓ of holonomic constraints. The factors c and ĉ are `magnifications`.
 
     **Arguments:** `method`; `lin`, the linearisation at the start of the step; `noise`,
-    the round-off of the functions; `h`, the step size.
+    the round-off of the functions of the system; `h`, the step size, of any sign. If h
+    is zero, no step is taken, and the result has no meaning.
     """
-    lin, h = stop_gradient(lin), jnp.abs(stop_gradient(h))
+    lin, noise, h = stop_gradient((lin, noise, h))
+    h = nonzero_or_one(jnp.abs(h))
     gained = noise.momentum + h * noise.force
     changes = max_norm(lin.momentum_inverse.absolute().matvec(gained))
     if lin.violation.shape[0]:

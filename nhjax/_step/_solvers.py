@@ -61,7 +61,8 @@ _GROSS = 1e-6
 # `jnp.linalg.solve`.
 _MOST_COORDINATES, _MOST_UNKNOWNS = 32, 256
 # After this many iterations of simplified Newton, the fallback to Newton's method takes
-# less time than further iterations.
+# less time than further iterations. With more than 100, `iterate` would accept a last
+# increment that Newton's method can reduce.
 _MOST_BEFORE_NEWTON = 100
 
 
@@ -451,7 +452,7 @@ def fibre_coordinate_scale(
         grown large, such as the heading of a car after many turns.
     - The round-off of invariants, through the impulses that keep them.
 
-    The additional round-off is at least `PART` of the measured round-off of the
+    The additional round-off is at least `PART` times the measured round-off of the
     functions of the system.
     """
     h = jnp.abs(stages.h)
