@@ -8,6 +8,8 @@ import pytest
 
 import nhjax
 from nhjax._numerics import measured_noise
+from nhjax._step._round_off import magnifications, noise_of_step
+from nhjax._system import FunctionNoise, linearise
 from support import hub_bicycle
 from support.long import long
 
@@ -91,6 +93,39 @@ def test_step_of_governor_near_dependent_constraints_is_accepted(stages):
     assert int(simplified.stats["num_iterations"]) > 1000
     # The round-off of the last step moves the velocities by 6e-9.
     np.testing.assert_allclose(simplified.ys.v, run(NEWTON).ys.v, rtol=0, atol=6e-9)
+
+
+@pytest.mark.parametrize("h", [1e-3, -1e-3])
+def test_noise_of_step_agrees_with_matrices_by_hand(h):
+    masses, slope = np.array([2.0, 3.0, 4.0]), 0.7
+    system = nhjax.LagrangianSystem(
+        lambda t, q, v, args: 0.5 * masses @ v**2,
+        holonomic=lambda t, q, args: q[0] + q[1] - 1.0,
+        nonholonomic=lambda t, q, v, args: v[2] - slope * v[0],
+    )
+    y = nhjax.initial_state(
+        system, jnp.array([0.4, 0.6, 0.0]), jnp.array([1.0, -1.0, slope])
+    )
+    rng = np.random.default_rng(0)
+    noise = FunctionNoise(*(jnp.asarray(rng.random(k)) for k in (3, 3, 2, 1)))
+    method = nhjax.LobattoIIIAB(3)
+
+    def found(noise):
+        lin = linearise(system, jnp.zeros(()), y.q, y.v, None)
+        return noise_of_step(method, lin, noise, jnp.asarray(h))
+
+    kinematic, holonomic = magnifications(method)
+    missed = kinematic * np.asarray(noise.on_velocities)
+    missed[1] += holonomic / abs(h) * float(noise.on_positions[0])
+    constraints = np.array([[-slope, 0.0, 1.0], [1.0, 1.0, 0.0]])
+    reaction = constraints.T / masses[:, None]
+    inverse = np.linalg.inv(constraints @ reaction)
+    gained = np.asarray(noise.momentum) + abs(h) * np.asarray(noise.force)
+    expected = np.max(gained / masses)
+    expected += np.max(np.abs(reaction) @ (np.abs(inverse) @ missed))
+    np.testing.assert_allclose(found(noise), expected, rtol=1e-13)
+    slopes = jax.grad(found)(noise)
+    assert all(not np.any(x) for x in jax.tree.leaves(slopes))
 
 
 def test_noise_of_function_includes_constants_that_cancel():
