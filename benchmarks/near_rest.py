@@ -42,11 +42,7 @@ from jaxtyping import Array, Float
 import nhjax
 from nhjax import systems
 from nhjax._numerics import max_norm
-from nhjax._step import (
-    first_step_state,
-    step,
-    StepArguments,
-)
+from nhjax._step import first_step_state, step, StepArguments
 from nhjax._step._equations import stage_residual, StageUnknowns
 from nhjax._step._jacobian import increment_size
 from nhjax._step._step import equations_of_step

@@ -34,10 +34,7 @@ from .._errors import naming, on_host
 from .._method import AbstractMethod
 from .._numerics import ClosureConverted
 from .._results import RESULTS
-from .._step import (
-    AbstractStageSolver,
-    StepRecord,
-)
+from .._step import AbstractStageSolver, StepRecord
 from .._system import (
     AbstractMechanicalSystem,
     check_multiplier,

@@ -127,10 +127,10 @@ def iterate(
     - when small increments have stopped falling, because they are then round-off;
     - when an increment is not finite, or far larger than the first increment and the
         iterate;
-    - after `max_iterations`. If these are more than 100, and the last increment is at
-        most 32 times the measured noise, the iteration has converged. It can be slow,
-        and slow convergence by a factor ρ leaves an error of increment / (1 - ρ); but
-        noise of an iteration adds up to noise / (1 - ρ), which nobody can avoid.
+    - after `max_iterations`. If more than 100 are allowed, the iteration has converged
+        if its last increment is at most 32 times the measured noise. Convergence by a
+        factor ρ per iteration leaves an error of increment / (1 - ρ). The noise of all
+        iterations adds up to an error of noise / (1 - ρ), which cannot be avoided.
 
     The size of round-off depends on the conditioning of the problem, so that a fixed
     threshold would be either too coarse or never met (Hairer, Lubich, Wanner, GNI,
