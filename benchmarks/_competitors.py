@@ -24,7 +24,7 @@ from sksundae.ida import IDA
 from nhjax import systems
 
 
-# The force f, the nonzero entries of the only row of B by index, and γ.
+# The force f; the nonzero entries of the single row of B, by index; and γ.
 Forces = tuple[list, dict[int, Any], Any]
 
 
@@ -95,8 +95,8 @@ class Problem(NamedTuple):
     field: Callable[[Any, Sequence], list]
     to_state: Callable[[Any, Any], Any]  # (q, v) to the state of `field`
     from_state: Callable[[Any], tuple[Any, Any]]
-    # The angle by which the velocity in nhjax is rotated to get the velocity that
-    # `forces` takes, as a function of q.
+    # A function of q: the angle by which the velocity in nhjax is rotated to get the
+    # velocity that `forces` takes.
     turn: Callable[[np.ndarray], float]
 
     def members(self, number: int) -> tuple[Array, Array]:
@@ -208,7 +208,7 @@ def diffrax_run(
 ) -> Callable[[Any, Array], Any]:
     """Create a function that integrates by diffrax, and returns the state at the end.
 
-    Its arguments are the initial state and the tolerance, or the step size if `fixed`.
+    The function takes the initial state and the tolerance, or the step size if `fixed`.
     `layout` is "array" for one trajectory. For an ensemble it is "vmap", where the
     state of a member is a tuple of scalars, or "stacked", where all members form one
     equation of shape (n, members) and share their steps.

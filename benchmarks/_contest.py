@@ -19,7 +19,7 @@ ACCURACIES = (1e-5, 1e-8, 1e-11)
 
 @dataclass
 class Run:
-    """One point of a diagram; `call` repeats the run that it stands for."""
+    """One point of a diagram; `call` repeats its run."""
 
     method: str
     rung: float
@@ -141,8 +141,8 @@ def contests(case: Measured) -> list[dict[str, Any]]:
     """Find the fastest method of each group for each accuracy.
 
     Each entry also has the ratio of nhjax's time to the time of this method. The entry
-    "others" is the fastest method of all other packages, with the ratio of nhjax's best
-    time to its time.
+    "others" is the fastest method of all other packages; its ratio uses nhjax's best
+    time.
     """
     ladders = by_method(case.runs)
     kinds = list(dict.fromkeys(kind(method) for method in ladders))

@@ -4,7 +4,7 @@ The index-reduced equations are the equations of `_competitors`, rewritten for T
 series. There, a product or a quotient costs a sum over all orders, a square costs half
 of this, and sums are cheap. Therefore common factors are taken out, and squares are
 written as powers. The options are the fastest for such small systems: `fast_math` makes
-runs up to 1.7 times faster, and not less accurate. `compact_mode` is off, because it
+runs up to 1.7 times faster, without loss of accuracy. `compact_mode` is off, because it
 makes runs about twice as long. `force_avx512`, `slp_vectorize` and `high_accuracy`
 improve neither time nor accuracy.
 
@@ -26,7 +26,7 @@ import heyoka as hy
 import numpy as np
 
 
-# With the disk cache, compile times would be those of loading a program that an earlier
+# With the disk cache, compile times would be the times to load programs that an earlier
 # process has compiled.
 hy.llvm_state.set_diskcache_enabled(False)
 VERSION = hy.__version__

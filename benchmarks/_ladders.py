@@ -34,8 +34,8 @@ from ._contest import Run
 
 
 CHECKED = 101  # the number of members of a larger ensemble that have a reference
-# For each number of stages: numbers of steps for t = 20, from errors that a plot shows
-# to errors at round-off.
+# For each number of stages: numbers of steps for t = 20. The errors range from visible
+# in a plot to round-off.
 LADDERS = {
     2: (100, 400, 1600),
     3: (50, 100, 200, 400, 800),
@@ -74,7 +74,7 @@ class Case:
     def _reference(self) -> np.ndarray | None:
         """Return (q, v) of the checked members at the end, or None if it is unknown."""
         # In the chaotic system, perturbations grow by a factor of up to 10⁵ until
-        # t = 50, and until t = 200 to the size of the motion itself. Therefore long
+        # t = 50, and reach the size of the motion itself by t = 200. Therefore long
         # trajectories have no reference.
         if self.name == "chaotic" and self.t > 60:
             return None
@@ -115,8 +115,8 @@ def thinned(ladder: tuple, limit: int) -> list:
 
 def compiled(function: Callable, args: tuple) -> tuple[Callable[..., Any], float]:
     """Return a compiled program, and the seconds of its first call."""
-    # The program is not compiled ahead of time, because each call of such a program has
-    # ten times the overhead.
+    # The program is not compiled ahead of time, because each call would then have ten
+    # times the overhead of a call through `jax.jit`.
     program = jax.jit(function)
     start = time.perf_counter()
     jax.block_until_ready(program(*args))
@@ -174,9 +174,9 @@ def nhjax_runs(case: Case, stages: tuple[int, ...], limit: int) -> Iterator[Run]
 
 
 def spread(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Spread the members of an ensemble over all devices.
+    """Return a function that spreads the members of an ensemble over all devices.
 
-    The functions take the ensemble and a tolerance.
+    It takes the ensemble and a tolerance, like `function`.
     """
     mesh = Mesh(np.asarray(jax.devices()), ("members",))
     members, everywhere = PartitionSpec("members"), PartitionSpec()

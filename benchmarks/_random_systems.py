@@ -107,7 +107,7 @@ def coordinates(q: PyTree[Array]) -> Array:
     """Return the numbers of a configuration as a vector.
 
     In a pose of SE(2), the cosine and the sine replace the angle: nhjax may subtract
-    turns from the angle, so that functions of it must have the period 2π.
+    full turns from the angle, so that functions of it must have the period 2π.
     """
     if not isinstance(q, tuple):
         return q.reshape(-1)

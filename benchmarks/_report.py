@@ -1,4 +1,4 @@
-"""Functions by which the benchmarks measure times, and write and read reports."""
+"""Functions of the benchmarks that measure times, and write and read reports."""
 
 import argparse
 import datetime

@@ -2,9 +2,9 @@
 
 `--only steps` runs the systems of the gallery, a bicycle and ten random systems, with
 step sizes from h = 0.004 up to failure. `SimplifiedNewton` and `Newton` solve the same
-steps from the same states. It then takes single steps from many states of systems with
-steep potentials, and of a body in a chart that the step may leave. An accepted step is
-judged by three figures that are computed here:
+steps from the same states. The command then takes single steps from many states of
+systems with steep potentials, and of a body in a chart that the step may leave. An
+accepted step is judged by three figures that are computed here:
 
 - the residual of the stage equations at the computed stages, relative to the size of
   its terms;
@@ -25,11 +25,11 @@ most 1e-13. In this case the equations have two solutions if the distance is mor
 the distance overflows, the residual decides. All other doubtful steps are wrongly
 accepted.
 
-The terms of an equation r(x; q) = 0 have the size |∂r/∂x| |x| + |∂r/∂q| |q|, where |x|
-has the largest absolute value of each kind of unknowns: of the velocities, of the
-multipliers and so on. A residual below this size times the unit round-off cannot be
-required (Oettli and Prager, 1964). An acceleration counts by its effect in a step: its
-size |u̇| is at least |u| / h.
+The terms of an equation r(x; q) = 0 have the size |∂r/∂x| |x| + |∂r/∂q| |q|. In |x|
+each unknown is replaced by the largest absolute value of its kind: of the velocities,
+of the multipliers and so on. A residual below this size times the unit round-off cannot
+be required (Oettli and Prager, 1964). An acceleration counts by its effect in a step:
+its size |u̇| is at least |u| / h.
 
 `--only starts` counts how often `initial_state(..., project=True)` refuses a state near
 the constraints. Each system of the gallery with constraints gets states that are moved
@@ -702,7 +702,7 @@ def count_near_zero(case: Case, number: int) -> list[dict[str, Any]]:
 
 def measure_steps(options: argparse.Namespace) -> list[dict]:
     """Measure the steps of the systems and stages that the options ask for."""
-    # The programs run only for seconds, but optimising them would take minutes.
+    # The programs run for seconds only, but optimising them would take minutes.
     jax.config.update("jax_disable_most_optimizations", True)
     wanted = options.systems or [""]
     makers = {
@@ -731,7 +731,7 @@ PARTS = ("steps", "starts", "near_zero")
 
 
 def main() -> None:
-    """Measure the requested parts, and save them with the saved data of the others."""
+    """Measure the requested parts; save them with the saved data of the other parts."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -17,7 +17,7 @@ steps or tolerances) are interpolated in logarithms.
 
 There are three more parts. `long` follows the energy of the orbit over t = 1e5 with
 constant, PID and reversible steps, and draws docs/step_sizes.png. `stages` measures
-which number of stages needs the least time for an error. `tolerance` compares errors
+which number of stages reaches a given error fastest. `tolerance` compares errors
 with tolerances for machines of the gallery, and draws docs/tolerances.png.
 """
 

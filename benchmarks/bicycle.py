@@ -4,7 +4,7 @@ The bicycle of Meijaard et al. (2007) runs uncontrolled for 20 s, in three
 manoeuvres: M1 at 4 m/s with a roll rate of 0.05 rad/s, M2 at 4.6 m/s with 0.5 rad/s,
 and M3 at 8 m/s with 0.05 rad/s. A solution is accepted if its energy varies by less
 than a thousandth of a percent of the energy at the start, 100 (max E - min E) / E_0
-< 1e-3, looked at after each step. The height in the energy is measured from the ground.
+< 1e-3, evaluated after each step. The height in the energy is measured from the ground.
 
 For each manoeuvre and number of stages, the table has the smallest number of steps that
 is accepted, its error at the end and its time, with the full Jacobian and with the
@@ -33,7 +33,7 @@ from ._report import markdown_table, number, write
 DURATION = 20.0
 LARGEST_DRIFT = 1e-3
 STAGES = (2, 3, 4)
-# The steps of the reference solution are small: the default Jacobian solves them.
+# The steps of the reference are so small that the default Jacobian suffices.
 REFERENCE_STAGES, REFERENCE_STEPS = 5, 4000
 REPEATS = 20
 # Larger numbers of steps are not tried.

@@ -6,7 +6,8 @@ For each system, retraction, number of stages and chart, this benchmark measures
 - the distance from the initial state after 50 steps of h and 50 steps of -h;
 - the largest relative error of the energy in the first tenth of a long run and in the
   whole run, which distinguishes a drift from an oscillation;
-- the iterations per step, and the time of a step relative to the chart at the start.
+- the iterations per step, and the time of a step relative to its time with the chart at
+  the start.
 """
 
 import argparse

@@ -1,8 +1,8 @@
 """A comparison of the closures of the multiplier on systems of the gallery, s = 2..5.
 
-For each closure, the table has the order of (q, v), the symmetry defect after 50 steps
-of h and 50 steps of -h, the largest energy error in the first and the last fifth of a
-long run, and the largest |Λ^s - λ_c| of the long run.
+For each closure, the table has the order of (q, v), the symmetry defect (the distance
+from the start after 50 steps of h and 50 steps of -h), the largest energy error in the
+first and the last fifth of a long run, and the largest |Λ^s - λ_c| of the long run.
 """
 
 import argparse

@@ -13,8 +13,8 @@ random moments, and resumed each time. Its files are compared, byte for byte, wi
 files of a run that was not interrupted. With `--processes P`, this test is repeated
 with two JAX processes. In addition, the compiled ensemble is then run P times by one
 process and by two processes, each with one core. The table has wall times and processor
-times, the larger of both processes. A wall time above the processor time shows that
-other programs were running.
+times, each the larger value of both processes. A wall time above the processor time
+shows that other programs were running.
 
     python -m benchmarks.ensembles --members 10000 100000 1000000 --num-steps 1000
 """
@@ -73,7 +73,7 @@ def problem(num_steps: int) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]
 
 
 def measure(members: int, num_steps: int, rounds: int = ROUNDS) -> dict[str, Any]:
-    """Measure the time per member and step of both, and this process's peak memory."""
+    """Measure times per member and step of `vmap` and the ensemble, and peak memory."""
     run, member = problem(num_steps)
 
     def chunks(count):

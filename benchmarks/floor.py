@@ -4,11 +4,11 @@
 unknowns, starting values, factorised structure, order of corrections and stopping rule.
 Its derivatives are written by hand. Quantities that do not change during the iterations
 are computed once. A second version iterates 2, 4 or 8 trajectories at once, in the
-lanes of a vector, until the slowest of them has converged. The only statistic that the
-program counts are the iterations.
+lanes of a vector, until the slowest of them has converged. The C++
+program counts iterations, but no other statistics.
 
-Both programs run on one core, if the platform allows to pin a process to a core. The
-table also has nhjax on all cores. Times are medians of seven measurements, with C++ and
+Both programs run on one core, if the platform can pin a process to a core. The table
+also has nhjax on all cores. Times are medians of seven measurements, with C++ and
 nhjax in turn; each measurement is the second of two successive runs. Both programs must
 end in the same states. `--smoke` takes a minute.
 """

@@ -2,7 +2,7 @@
 
 A scalar function of the final state is differentiated with respect to the initial
 state, dt and the parameters of the system. Times are given as ratios to the time of the
-run without gradient; both are measured in turn in one process. They are medians of
+run without gradient; both are measured in turn in one process. Times are medians of
 seven, or of three for more than 10⁴ steps. Processor times, which add up all threads,
 depend less on other load of the machine. Each system and number of steps has its own
 process. `temp` is the memory that the compiled program allocates. `resident` is the
@@ -205,8 +205,8 @@ def compilation(name: str, stages: list[int]) -> list[tuple[int, float, float]]:
 def modes(name: str, stages: int, num_steps: int) -> dict[str, float]:
     """Measure forward mode and reverse mode, as ratios to the time of the run.
 
-    (q, v) at the end is differentiated with respect to v0, or in products with respect
-    to v0 and dt. The row "reverse gradient" differentiates the loss instead.
+    The end (q, v) is differentiated with respect to v0. In products of its derivative
+    with tangents, dt varies too. The row "reverse gradient" differentiates the loss.
     """
     system, y0 = EXAMPLES[name]()
 

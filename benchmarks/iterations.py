@@ -3,7 +3,7 @@
 For each machine `SimplifiedNewton` without the fallback runs 20 steps, once with the
 default Jacobian, which omits some terms, and once with `jacobian="full"`. The table has
 the iterations and the time of a step, the processor time of the first call, and the
-largest step size with which all steps are solved, found up to a factor 1.2.
+largest step size with which all steps are solved, found to within a factor of 1.2.
 `benchmarks.machines` measures the first calls of all machines with default options.
 
 A second table compares `Newton` with `SimplifiedNewton(jacobian="full")` on some of the
@@ -38,7 +38,7 @@ BY_NEWTON = (
     ("RollingTorus", 3),
     ("bicycle, 4.6 m/s", 4),
 )
-# The largest step is searched up to this factor times the step of the case.
+# The largest step is searched for up to this multiple of the step of the case.
 LARGEST_FACTOR = 32
 STEP_RATIO = 1.2
 RADIUS, LENGTH, TRACK = 0.1, 0.35, 0.5
@@ -150,7 +150,7 @@ def timed(case: Case, solver: Any) -> tuple[Callable[..., Any], dict[str, Any]]:
 
 
 def measured(case: Case, jacobian: Any) -> dict[str, Any]:
-    """Run a case with a choice of the Jacobian, and search the largest step."""
+    """Run a case with a choice of the Jacobian, and search for the largest step."""
     solver = nhjax.SimplifiedNewton(jacobian=jacobian, fallback=False)
     run, found = timed(case, solver)
 

@@ -34,9 +34,9 @@ STAGES = 3
 # The duration of the squeezer is shorter, because the constant torque of its motor
 # accelerates it without limit.
 SHORTER = {"AndrewsSqueezer": 1.0}
-# Other machines use the step of their picture in the gallery. The machines below need
-# smaller steps: for instance, gaits accelerate their machines to 9 and 60 m/s, and the
-# crank turns by 0.6 rad in a step of its picture.
+# The machines below need smaller steps than their pictures in the gallery. For example,
+# gaits accelerate their machines to 9 and 60 m/s, and the crank turns by 0.6 rad in a
+# step of its picture. Other machines use the step of their picture.
 FINER = {
     "Snakeboard": 0.01,
     "RollerRacer": 0.0025,

@@ -1,4 +1,4 @@
-"""Steps near rest, judged in 50 digits: are solved steps refused, or others accepted?
+"""Steps near rest, judged in 50 digits: are any refused or accepted wrongly?
 
 Near rest, velocities are small. The functions of a system also contain constants, such
 as a wheel's radius or a weight, whose round-off does not become small. Each system
@@ -16,8 +16,8 @@ one unit of the last digit of the velocities.
 
 A refused step whose distance is at most `SOLVED` times the noise should have been
 accepted. An accepted step whose distance is more than `DOUBTFUL` times the noise is
-judged again, with a larger noise: if the position at the start of the step moves by one
-unit in the last place, the solution moves too, and this distance now counts as noise,
+judged again, with a larger noise. If the position at the start of the step moves by one
+unit in the last place, the solution moves too. This movement now counts as noise,
 because float64 does not represent the start more accurately. If the distance is still
 more than `DOUBTFUL` times the noise, the step should have been refused. If the noise is
 more than `DETERMINED` times the velocities, for instance because iterates diverged, a

@@ -301,7 +301,7 @@ def disc_on_its_side(force: Any) -> Machine:
 
 
 def rolling_resistance(contacts: rolling.Contacts) -> Any:
-    """Return the torque N e against the angular velocity along the ground."""
+    """Return the torque N e, opposite to the angular velocity along the ground."""
     return friction.RollingResistance(contacts, "body", ROLLING_ARM, smoothing=1e-3)
 
 

@@ -2,8 +2,8 @@
 
 The axes are the number of stages s, the number of coordinates n, the number of
 constraints, the size of a batch, and the number of steps. The system is the chaotic
-system with n = 2m + 1 coordinates. Only the number of constraints is varied in three
-other families of systems: skates with a diagonal mass matrix, a chain of pendula (each
+system with n = 2m + 1 coordinates. In three other families of systems, only the number
+of constraints is varied: skates with a diagonal mass matrix, a chain of pendula (each
 link shares coordinates with two others, so that C = B M⁻¹ Bᵀ is tridiagonal), and a
 star of rods on one body (C is full).
 
@@ -61,7 +61,7 @@ class Axis(NamedTuple):
 
 
 def chaotic(m: int) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
-    """Create the chaotic system, with a start at which it does not stiffen with m.
+    """Create the chaotic system, with a start whose frequencies do not grow with m.
 
     At the start, q_2..q_{m+1} are from 0.6 to 0.2, as for m = 3. The gallery starts
     from m/5..1/5, which would raise the frequencies for larger m, and therefore the
@@ -90,7 +90,7 @@ def skates(n: int, k: int) -> tuple[nhjax.LagrangianSystem, nhjax.State]:
     """Create a system with a diagonal mass matrix and k <= n / 2 constraints.
 
     L = ½ Σ μ_i v_i² - ½ |q|² and Φ_a = v_a - q_{n/2+a} v_{n/2+a+1}. The constraints are
-    like those of skates, each of which steers the next.
+    like constraints of skates, each of which steers the next.
     """
     half = n // 2
     masses = np.linspace(1.0, 2.0, n)

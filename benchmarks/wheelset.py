@@ -19,11 +19,11 @@ these gaps are the `args` of the constraint. Creep is evaluated at the yaw θ / 
 and π has eight digits. One detail is different here: the test set does not divide the
 yaw torque of the reactions by cos φ. This changes the result by less than 1e-7.
 
-The errors are relative errors at the end, the largest of the 17 unknowns. They are
-given relative to the published numbers and to two references of our own: a run with
-small steps, and diffrax's Dopri8 on the equations solved for the accelerations. Errors
-fall more slowly than the order of the method predicts, because the creep force has a
-kink where a wheel begins to slide, which happens often.
+Each error is the largest relative error of the 17 unknowns at the end, compared with
+the published numbers and with two references of our own: a run with small steps, and
+diffrax's Dopri8 on the equations solved for the accelerations. Errors fall more slowly
+than the order of the method predicts, because the creep force has a kink where a wheel
+begins to slide, which happens often.
 
     python -m benchmarks.wheelset
 """
@@ -139,7 +139,7 @@ def contact(q: Array, side: Array) -> Contact:
     axle, down, back = axes(q[3], q[4])
     taper = -side * math.tan(CONE_ANGLE)
     # The normal of the cone is (cos ψ) down + (sin ψ) back - (taper) axle. The rail
-    # does not change along z, so that the normal of the contact has no such part.
+    # does not change along z, so that the normal of the contact has no z component.
     size = jnp.hypot(down[2], back[2])
     angle = jnp.arctan2(down[2], -back[2]) - jnp.arcsin(taper * axle[2] / size)
     outwards = jnp.cos(angle) * down + jnp.sin(angle) * back

@@ -19,10 +19,10 @@ fastest method of all other packages.
 The error is the largest error of (q, v) at the end over the members. The reference is
 the exact solution, or an extrapolation of order 20 in long double. In ensembles of more
 than 101 members, about 101 members at equal distances have a reference. The tables also
-have |Φ|, relative to the possible size of its terms, and the relative energy error.
-Both are taken at the end, and are the largest over the members.
+have |Φ|, relative to the possible size of its terms, and the relative energy error:
+their largest values over the members at the end.
 
-Saved results of cases that a command does not measure are not changed.
+A command does not change saved results of cases that it does not measure.
 """
 
 import argparse

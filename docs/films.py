@@ -35,7 +35,7 @@ class Film(NamedTuple):
 
 
 def bicycle() -> tuple[Any, nhjax.Solution]:
-    """A bicycle without hands on it, pushed sideways, at a speed where it is stable."""
+    """An uncontrolled bicycle, pushed sideways at a speed at which it is stable."""
     machine = nhjax.systems.WhippleBicycle.running(5.0, lean_rate=0.45)
     return machine, _run(machine.system, machine.initial_state(), 4.0, 200)
 
@@ -52,7 +52,7 @@ def mecanum() -> tuple[Any, nhjax.Solution]:
     mixing = jnp.array([[-1.0, 1, 1, -1], [-1, 1, -1, 1], [1, 1, 1, 1]]).T
 
     def controls(t, qpos, qvel, args):
-        """Return torques that track the speeds of sideways, turning and ahead."""
+        """Return torques that track the wheel rates of the three motions."""
         shares = jnp.stack([_pulse(t, 0.0), _pulse(t, 2.0), _pulse(t, 4.0)])
         wanted = mixing @ (jnp.array([6.0, 5.0, 8.0]) * shares)
         return 0.4 * (wanted - qvel[3:])

@@ -160,7 +160,7 @@ def _drifts(*names: str) -> Callable[[Run], list[Curve]]:
 
 
 def _bar(place: np.ndarray, angle: float, back: float, ahead: float) -> np.ndarray:
-    """A line at an angle, from `back` behind a place of the plane to `ahead` of it."""
+    """A line at an angle, from `back` behind a point in the plane to `ahead` of it."""
     along = np.array([np.cos(angle), np.sin(angle)])
     return place + np.outer([-back, ahead], along)
 
@@ -319,7 +319,7 @@ def _draw_paths(figure: Any, picture: Picture, done: Run) -> None:
 
 
 def _set_space(ax: Any, points: np.ndarray, ground: bool) -> None:
-    """Give the axes of space equal units, and draw the ground."""
+    """Give the three axes equal units, and draw the ground."""
     low, high = points.min(axis=0), points.max(axis=0)
     margin = 0.04 * np.max(high - low)
     low, high = low - margin, high + margin
@@ -399,7 +399,7 @@ def save(figure: Figure, name: str) -> None:
 
 
 def _distance_to_neighbour(index: int) -> Callable[[Run], list[Curve]]:
-    """The distance to a run from a start that differs by 1e-8 in one coordinate."""
+    """The distance to a run whose start differs by 1e-8 in one coordinate."""
 
     def curves(run_: Run) -> list[Curve]:
         q0 = run_.example.q0.at[index].add(1e-8)
@@ -469,7 +469,7 @@ def _fall(run_: Run) -> list[Curve]:
 
 
 def _two_stages(run_: Run) -> list[Curve]:
-    """The energy with two stages, whose motion is back at the start after 12 steps."""
+    """The energy with two stages; this run returns to its start after 12 steps."""
     number = 12
     size = 2 * np.sin(np.pi / number)
     coarse = run(run_.example, 2 * number * size, 2 * number, stages=2)
@@ -606,7 +606,7 @@ def _machine(name: str, **changes: Any) -> Picture:
         lines = [np.array([points[name][0] for name in machine.rods])]
         return lines + [machines.circle(points, wheel)[0] for wheel in machine.wheels]
 
-    # Names that end in a letter or a number get no article.
+    # Names that end in a single letter or digit get no article.
     names = [x.replace("_", " ") for x in machine.traced]
     names = [x if re.search(r"\b[A-Z0-9]$", x) else f"the {x}" for x in names]
     traced = f"path{'s' * (len(names) > 1)} of {' and '.join(names)}"
@@ -1091,7 +1091,7 @@ class Unreadable(ValueError):
 
 
 class _Reader:
-    """A reader of formulas as docstrings write them.
+    """A reader of formulas in the notation of the docstrings.
 
     It is a recursive-descent parser. The factors of a product stand side by side, with
     or without spaces. The numerator of a fraction is the whole product before its bar.
@@ -1106,7 +1106,7 @@ class _Reader:
         return re.compile(pattern).match(self.text, self.at)
 
     def take(self, pattern: str) -> str | None:
-        """Return the text that matches a pattern, and move behind this text."""
+        """Return the text that matches a pattern, and move past this text."""
         match = self.looking(pattern)
         if match is None:
             return None
@@ -1383,7 +1383,7 @@ def _balanced(text: str) -> str:
 
 
 def _is_mathematics(word: str, behind: int) -> bool:
-    """Whether a word is part of a formula, if `behind` words of it follow this word."""
+    """Whether a word is part of a formula of which `behind` more words follow."""
     if word in ("a", "A", "I"):
         return behind == 0
     plain = re.sub(r"_[A-Za-z]+", "", word)

@@ -33,8 +33,8 @@ class Machine(NamedTuple):
 
     - `rods`: the names of points that are connected, one after the other.
     - `traced`: the names of points whose paths are drawn.
-    - `wheels`: the names of a hub, of a point of the rim, and of another point of the
-        wheel's plane, of each wheel that an animation shows.
+    - `wheels`: for each wheel that an animation shows, the names of its hub, of a point
+        of its rim, and of another point in its plane.
     - `follow`: the name of a point that stays in the centre of an animation.
     """
 
@@ -221,7 +221,7 @@ def circle(points: dict[str, np.ndarray], wheel: tuple[str, str, str]) -> np.nda
 
 
 def animate(machine: Machine, path: Path, seconds: float = 3.0) -> None:
-    """Write an animation of a machine that takes some seconds."""
+    """Write an animation of a machine, with the given length in seconds."""
     points = run(machine)
     ts = np.linspace(0, machine.duration, machine.num_steps + 1)
     rims = {" ".join(wheel): circle(points, wheel) for wheel in machine.wheels}
@@ -240,7 +240,7 @@ def animate(machine: Machine, path: Path, seconds: float = 3.0) -> None:
         ax=ax,
     )
     animation.save(path, writer=PillowWriter(fps=FRAME_RATE), dpi=80)
-    # A few colours halve the file.
+    # A palette of few colours halves the size of the file.
     with Image.open(path) as pictures:
         first, *others = [
             picture.convert("RGB").quantize(8, dither=Image.Dither.NONE)

@@ -65,7 +65,7 @@ def source(cell: dict[str, Any]) -> str:
 
 
 def code_hash(notebook: dict[str, Any]) -> str:
-    """Return a number in hexadecimal digits that changes with the code."""
+    """Return a hash of the cells of code, in hexadecimal digits."""
     cells = [source(x) for x in notebook["cells"] if x["cell_type"] == "code"]
     return hashlib.sha256(json.dumps(cells).encode()).hexdigest()[:16]
 
@@ -121,13 +121,13 @@ def run(name: str) -> None:
 
 
 def _kept(outputs: list[Any]) -> list[Any]:
-    """Return what is printed and drawn, in forms that are equal in each run."""
+    """Return printed text and figures, in forms that do not change between runs."""
     kept = []
     for output in outputs:
         if output.get("name") == "stderr":
             continue
         if "data" in output:
-            # Tables in HTML have random names, and figures the address of an object.
+            # HTML tables contain random names, and figures the address of an object.
             data = output.data
             if "image/png" in data:
                 output.data = {"image/png": _compressed(data["image/png"])}
@@ -149,7 +149,7 @@ def _compressed(data: str) -> str:
 
 
 def _with_palette(picture: Image.Image, largest: int) -> bytes:
-    """Return a PNG of at most `largest` bytes, with as many colours as they allow."""
+    """Return a PNG of at most `largest` bytes, with as many colours as possible."""
     for colours in (256, 64, 48, 32, 16):
         file = io.BytesIO()
         fewer = picture.quantize(colours, dither=Image.Dither.NONE)

@@ -31,7 +31,7 @@ from matplotlib.path import Path as MplPath
 DOCS = Path(__file__).parent
 PACKAGE = DOCS.parent / "nhjax"
 
-# From the ground up. Within a floor a room may import from those to its left.
+# The lowest floor comes first. A room may import from rooms to its left on its floor.
 FLOORS = (
     ("_custom_types", "_errors", "_results"),
     ("lanes",),
@@ -77,7 +77,7 @@ def read_sources(package: Path = PACKAGE) -> dict[str, str]:
 
 
 def read_imports(sources: Mapping[str, str], name: str = "nhjax") -> list[Import]:
-    """Every import of a module of the package by another, also inside functions."""
+    """Every import between modules of the package, also inside functions."""
     folders = {module.rpartition(".")[0] for module in sources} | {""}
     found = []
     for module, text in sources.items():
@@ -206,7 +206,7 @@ def folders(sources: Mapping[str, str]) -> list[str]:
 
 
 def count(folder: Path, without: Path | None = None) -> tuple[int, int]:
-    """The number of Python files below a folder, and of their lines.
+    """The numbers of Python files below a folder, and of their lines.
 
     Files below `without` are not counted.
     """
@@ -219,8 +219,8 @@ def count(folder: Path, without: Path | None = None) -> tuple[int, int]:
     return len(paths), lines
 
 
-# The function that repeats a sweep until it converges. An evaluation of the Lagrangian
-# below it is one inside the stage iteration.
+# The function that repeats a sweep until it converges. If it is on the stack, the
+# Lagrangian is evaluated inside the stage iteration.
 ITERATION = "iterate"
 
 
@@ -245,10 +245,10 @@ class Stack(NamedTuple):
 def stacks(nhjax: Any, transformation: str) -> list[Stack]:
     """The stack at each evaluation of the Lagrangian of one call of `integrate`.
 
-    The Lagrangian is traced once, and then it is one operation, and so are its
-    derivatives. It contains an arctangent, by which its operations are told from those
-    of other functions. They record the traceback whenever they are bound. Frames of
-    other packages are left out.
+    The Lagrangian is traced once, to one operation; each derivative is one operation
+    too. The Lagrangian contains an arctangent, which identifies these operations. The
+    stack is recorded whenever one of them is bound, without the frames of other
+    packages.
 
     **Arguments:**
 
@@ -305,15 +305,16 @@ def stacks(nhjax: Any, transformation: str) -> list[Stack]:
 
 
 def deepest(found: Iterable[Stack]) -> Stack:
-    """The stack with the most frames; among equals the one in most files."""
+    """The stack with the most frames; among equals, the stack with the most files."""
     return max(found, key=lambda stack: (len(stack.frames), stack.num_files))
 
 
 def deepest_stacks(nhjax: Any) -> dict[str, Stack]:
     """The deepest evaluations of the Lagrangian, by the transformation of the call.
 
-    - `plain`, `vmap`, `grad`: those inside the stage iteration.
-    - `grad, derivative`: those that only the derivative of the run makes.
+    - `plain`, `vmap`, `grad`: the deepest evaluation inside the stage iteration.
+    - `grad, derivative`: the deepest evaluation that only the derivative of the run
+        makes.
     """
     by_call = {name: stacks(nhjax, name) for name in ("plain", "vmap", "grad")}
     result = {

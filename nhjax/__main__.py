@@ -101,8 +101,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_options(parser: argparse.ArgumentParser, function: Callable) -> None:
     parameters = inspect.signature(function).parameters
-    # Studies that set the length in time also accept it as a number of steps. Studies
-    # that set the length in steps have their own option for this.
+    # Studies with a `final_time` also accept the length of the run as a number of
+    # steps. Studies that set the length in steps have their own option for it.
     length = (
         parser.add_mutually_exclusive_group() if "final_time" in parameters else None
     )

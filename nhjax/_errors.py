@@ -166,7 +166,7 @@ class Check(NamedTuple):
 
 
 def require(tree: T, *checks: Check) -> T:
-    """Return `tree` if all checks hold; otherwise raise for the first that fails.
+    """Return `tree` if all checks hold; otherwise raise for the first failed check.
 
     With concrete values the exception is raised immediately. With traced values it is
     raised when the compiled program runs, as a runtime error of JAX with the same

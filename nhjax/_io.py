@@ -1,8 +1,8 @@
 """The functions `save` and `load`, which write states and solutions to files.
 
 A file is an .npz of NumPy without pickled objects. It has one entry for each array of
-the tree, and the entry `nhjax`, a header as JSON that describes the structure of the
-tree by the names of classes and fields. No code is stored.
+the tree, and the entry `nhjax`, a JSON header that describes the structure of the tree
+by the names of classes and fields. No code is stored.
 """
 
 import dataclasses
@@ -55,7 +55,7 @@ def save(path: str | os.PathLike[str], tree: Any) -> None:
 
     The file is an .npz of NumPy without pickled objects. `numpy.load` reads it too:
     each array has its path in the tree as its name, such as `ys.q`, and is stored bit
-    for bit. The entry `nhjax` is a header as JSON with the version of the format and of
+    for bit. The entry `nhjax` is a JSON header with the versions of the format and of
     nhjax, and the structure of the tree by the names of classes and fields. No code is
     stored, so that files do not depend on the versions of Python, JAX and equinox.
 

@@ -144,8 +144,8 @@ class AbstractForce(AbstractSummable):
     """A generalised force F(t, q, v, args), the `force` of a `LagrangianSystem`.
 
     Add forces, and functions of (t, q, v, args), with `+`. Parameters that are numbers
-    or arrays are leaves: new values do not recompile, and derivatives with respect to
-    them are available. A new function recompiles.
+    or arrays are pytree leaves: new values cause no recompilation, and derivatives with
+    respect to them are available. A new function causes a recompilation.
 
     A `HamiltonianSystem` passes momenta, not velocities, to its forces. Therefore use
     `Drag`, `Motor` and a `Spring` with a damper only in a `LagrangianSystem`.
@@ -449,7 +449,7 @@ class Drag(_AbstractPulledBack):
     such as the viscous friction of a bearing.
 
     The quadratic part has a kink at u = 0. If a point that moves along a line turns
-    back in a step, that step has order 2 only.
+    back in a step, that step has only order 2.
 
     **Arguments:**
 
@@ -461,7 +461,7 @@ class Drag(_AbstractPulledBack):
         function of (t, q, v, args) that returns one; zero by default.
     - `manifold`: the `manifold` of the system, required if it has one.
 
-    **Raises:** when called, `ShapeError` if the medium has another shape than x.
+    **Raises:** when called, `ShapeError` if the shapes of the medium and x differ.
 
     !!! example
 
@@ -503,7 +503,7 @@ class Motor(_AbstractPulledBack):
     **Arguments:**
 
     - `angle`: φ, called as `angle(t, q, args)` [rad], of shape (): the rotation of the
-        part that the motor drives relative to the part that carries the motor.
+        driven part relative to the part that carries the motor.
     - `command`: c, a number or a function of (t, q, v, args). Values outside
         [-1, 1] are not limited: see `saturated`.
     - `stall_torque`: τ₀ [N m], the torque of the motor at rest with c = 1.
@@ -549,8 +549,8 @@ class Brake(_AbstractPulledBack):
 
     - `angle`: φ, called as `angle(t, q, args)` [rad], of shape (): the rotation of the
         wheel relative to the part that carries the brake.
-    - `torque`: τ >= 0 [N m], a number or a function of (t, q, v, args). For a friction
-        that depends on reactions use `nhjax.friction.JointFriction`.
+    - `torque`: τ >= 0 [N m], a number or a function of (t, q, v, args). For friction
+        that depends on reactions, use `nhjax.friction.JointFriction`.
     - `smoothing`: ω₀ [rad/s]. Below ω₀ the brake acts like a damper, so that a loaded
         wheel creeps instead of standing still.
     - `manifold`: the `manifold` of the system, required if it has one.
@@ -593,8 +593,8 @@ def _angle(angle: Any, t: Any, q: Any, args: Any) -> Array:
 def saturated(x: ArrayLike, limit: ArrayLike) -> Array:
     """Limit a signal smoothly: limit · tanh(x / limit).
 
-    Use this function instead of `jnp.clip` in forces, because each step uses their
-    derivatives. `jnp.clip` has a kink at the limit: steps across the kink need more
+    Use this function instead of `jnp.clip` in forces, because each step differentiates
+    the forces. `jnp.clip` has a kink at the limit: steps across the kink need more
     iterations, and have a lower order.
 
     **Arguments:**

@@ -4,7 +4,7 @@ The load of a contact is a reaction, so that these forces depend on the multipli
 laws are smooth: at speeds far below a parameter u₀, the friction is proportional to the
 velocity. A contact that should rest on an incline therefore creeps: if it needs the
 fraction r < 1 of the largest friction, its speed is u₀ artanh(r). Near rest, the
-iteration of a step converges fast if the step size is about u₀ · mass / friction.
+iteration of a step converges fast for steps up to about u₀ · mass / friction.
 """
 
 import abc
@@ -250,7 +250,7 @@ class _AbstractOnContact(AbstractForceOfReactions):
 
 
 class Sliding(_AbstractOnContact):
-    """Friction of a contact that slides, in the directions that slip.
+    """Friction of a sliding contact, in the directions in which it slips.
 
     The force on the body is -|N| μ(u) in the direction of the velocity u at which the
     contact slides. u is the part of the contact's velocity that its constraints leave
@@ -359,8 +359,8 @@ class RollingResistance(_AbstractOnContact):
 
     The torque is -|N| e tanh(|ω| / ω₀) in the direction of ω, the component of the
     body's angular velocity parallel to the plane. This law does not describe the
-    friction of a contact that runs along the rim of a spinning coin: write such a
-    friction as your own force.
+    friction of a contact that runs along the rim of a spinning coin: write your own
+    force for it.
 
     **Arguments:**
 

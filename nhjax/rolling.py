@@ -7,7 +7,7 @@ are the tangential components (along the ground) of the velocity
 
     u = ẋ + Ṙ Rᵀ (c - x) - w
 
-of this point of the body relative to the ground, which moves with the velocity w. Each
+of the point c of the body relative to the ground, which moves with the velocity w. Each
 multiplier is the force in newtons in the direction of its constraint. An optional
 constraint prevents the body from spinning about the normal of the ground; its
 multiplier is a torque in N m.
@@ -147,9 +147,8 @@ class Plane(AbstractGround):
 
     - `normal`: n, which points away from the ground; its length does not matter.
     - `height`: h [m], the distance of the plane from the origin along n.
-    - `velocity`: w [m/s], the velocity of the ground in space, called as
-        `velocity(t, x, args)` at a point x, for a turntable or a belt; by default the
-        ground rests.
+    - `velocity`: w [m/s], the velocity of the ground at a point x in space, called as
+        `velocity(t, x, args)`, for a turntable or a belt; by default the ground rests.
 
     !!! example
 
@@ -252,9 +251,9 @@ class Surface(AbstractGround):
 class Heightfield(eqx.Module):
     """The elevation of a `Surface` through given heights on a rectangular grid.
 
-    The surface is a cubic spline, which has continuous curvature. Outside of the grid
-    the polynomials at its border continue. The third derivatives jump at the lines of
-    the grid: where a contact crosses a line, no method has an order above 3.
+    The surface is a cubic spline, which has continuous curvature. Outside of the grid,
+    the polynomials at its border are continued. The third derivatives jump at the lines
+    of the grid: where a contact crosses a line, no method has an order above 3.
 
     **Arguments:**
 
@@ -293,9 +292,9 @@ class Heightfield(eqx.Module):
             )
         import scipy.ndimage
 
-        # The mirrored border of the spline has an error that falls by the factor 0.268
-        # with each row: 32 extra rows remove it. Two rows outside of the grid are kept,
-        # which are enough to evaluate the spline at the border of the grid.
+        # Mirroring at the border causes an error of the spline that falls by the factor
+        # 0.268 with each row: 32 extra rows remove it. Two rows outside of the grid are
+        # kept, which are enough to evaluate the spline at the border of the grid.
         padded = np.pad(given, 32, mode="reflect", reflect_type="odd")
         spline = scipy.ndimage.spline_filter(padded, order=3, mode="mirror")
         self.coefficients = spline[30:-30, 30:-30]
@@ -520,9 +519,9 @@ class Wheel(AbstractContact):
     = n x `along`.
 
     The axle must not be perpendicular to the ground, because then no single point of
-    the rim is the lowest. A track that runs over a sprocket is modelled as
-    a wheel, too: a wheel with the radius of the sprocket that touches the ground under
-    the middle of the track.
+    the rim is the lowest. A track that runs over a sprocket can be modelled as a wheel
+    that has the radius of the sprocket and touches the ground under the middle of the
+    track.
 
     **Arguments:**
 
@@ -534,11 +533,11 @@ class Wheel(AbstractContact):
     - `tube_radius`: the radius of the tube of a torus [m], given like `radius`.
     - `axle`: the direction of the axle in the frame of the wheel.
     - `no_slip`: the directions in which the wheel does not slip: `"along"`, `"across"`,
-        or an angle [rad] from `along` towards `across`; with `"spin"` it does not turn
-        about the normal of the ground either. An omni wheel has
-        `("along",)`. A mecanum wheel has the angle of the axles of its rollers, π/4 or
-        -π/4. A wheel that slides has `()`. If two wheels share an axle, only one of
-        them needs `"across"`.
+        or an angle [rad] from `along` towards `across`; with `"spin"` the wheel does
+        not turn about the normal of the ground either. An omni wheel has `("along",)`.
+        A mecanum wheel has the angle of the axles of its rollers, π/4 or -π/4. A wheel
+        that slides has `()`. If two wheels share an axle, only one of them needs
+        `"across"`.
     - `touches`: whether the height of the contact is a constraint. Pass False if the
         coordinates fix the height, as the coordinates (x, y, heading) of a robot do.
     - `ground`: a `Plane` or a `Surface`; by default the plane z = 0.
@@ -611,8 +610,8 @@ class Ellipsoid(AbstractContact):
     - `semi_axes`: three lengths [m] along the axes of the body, or the radius of a
         ball; or a function of `args` that returns them.
     - `no_slip`: the directions in which the body does not slip; `()` if it slides. With
-        `"spin"` it does not turn about the normal of the ground either, like a rubber
-        ball.
+        `"spin"` the body does not turn about the normal of the ground either, like a
+        rubber ball.
     - `touches`, `ground`, `manifold`: as for `Wheel`.
 
     **Raises:** when called, `ShapeError` if the pose has other shapes.
@@ -975,10 +974,10 @@ def margin(
     *,
     load: ArrayLike | ForceFunction | None = None,
 ) -> Callable[[Any, State, Any], FloatScalar]:
-    """Return a function for the reserve of friction of a contact.
+    """Return a function that computes the friction reserve of a contact.
 
-    It is the function (t, y, args) -> μ |N| - |F_t| [N] of the friction coefficient μ,
-    the normal force N and the force F_t of the constraints along the ground. The
+    It is the function (t, y, args) -> μ |N| - |F_t| [N], with the friction coefficient
+    μ, the normal force N and the force F_t of the constraints along the ground. The
     contact rolls where its value is positive. Pass the function to `SaveAt(fn=)`. To
     stop a run where the value becomes zero, use `slips`.
 

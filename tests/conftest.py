@@ -6,35 +6,36 @@ import shutil
 from pathlib import Path
 
 
-# Matrices of some 50 rows are solved in less time than threads take to meet, and the
-# workers of pytest-xdist leave no core to wait on.
+# Solving with a matrix of about 50 rows takes less time than synchronising threads, and
+# the workers of pytest-xdist already use all cores.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# Nearly all the time goes into tracing and compiling programs that run once, hence the
-# compiler's older and quicker code generator, in one piece rather than in 32. The
-# backend reads this when it starts; what the environment says comes last and wins.
+# Nearly all the time goes into tracing and compiling programs that run once. These
+# flags select the compiler's older, quicker code generator, with one piece of code
+# rather than 32. The backend reads them when it starts; flags in the environment come
+# last and win.
 QUICK_FLAGS = (
     "--xla_cpu_parallel_codegen_split_count=1 "
-    # Passes over loops, which take a quarter of the time.
+    # Disable passes over loops, which take a quarter of the time.
     "--xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops"
 )
-# From 0.11.1 on there is no older code generator, and a flag that the compiler does not
-# know ends the process without a word.
+# From 0.11.1 on there is no older code generator, and an unknown flag ends the process
+# without a message.
 if tuple(map(int, importlib.metadata.version("jaxlib").split(".")[:3])) < (0, 11, 1):
     QUICK_FLAGS = f"--xla_cpu_use_fusion_emitters=false {QUICK_FLAGS}"
 os.environ["XLA_FLAGS"] = f"{QUICK_FLAGS} {os.environ.get('XLA_FLAGS', '')}".strip()
 
 # Programs are compiled once for all processes and runs of the tests. A run whose
-# programs are all in the cache takes a third less time. Variables that are set already
-# are kept.
+# programs are all in the cache takes a third less time. Environment variables that are
+# already set keep their values.
 CACHE = Path(__file__).parent.parent / ".pytest_cache" / "compiled"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
-# Python's collector looks for cycles each time that 700 objects have been made, which
-# takes a third of the time of a long trace; what is traced here stays in caches anyway.
-# The libraries below are loaded in less time, too.
+# By default Python's collector looks for cycles after every 700 new objects, which
+# takes a third of the time of a long trace. Traced objects stay in caches anyway. The
+# libraries below also load faster.
 gc.set_threshold(100_000)
 
 import jax
@@ -56,8 +57,8 @@ def pytest_sessionstart(session):
         shutil.rmtree(CACHE)
 
 
-# A file stays in one process: of two, those that take longest come first, lest one
-# process be left with one of them when all others are done.
+# Each file runs in one process. The longest files come first, so that no process still
+# runs one of them when the others have finished.
 LONGEST = (
     "test_as_users_run.py",
     "systems/test_bicycle_stability.py",
@@ -90,7 +91,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: rank.get(item.path, len(rank)))
 
 
-# Files that use the same runs, which a process keeps.
+# Files that use the same runs, which each process caches.
 TOGETHER = ("tests/integrate/test_geometry.py", "tests/step/test_stage_equations.py")
 
 
@@ -104,14 +105,14 @@ def pytest_xdist_make_scheduler(config, log):
             file = super()._split_scope(nodeid)
             return TOGETHER[0] if file.endswith(TOGETHER) else file
 
-    # Another way to distribute that was asked for, such as `--dist=load`, is taken.
+    # If the user selects another distribution, such as `--dist=load`, it is kept.
     if config.getoption("dist") == "loadfile":
         return Scheduling(config, log)
 
 
 @pytest.fixture(autouse=True, scope="session")
 def rare_garbage_collection():
-    """Tracing makes a great many objects, most of which live: looking costs a tenth."""
+    """Collect rarely: most traced objects stay, and a search takes 10% of the time."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(100_000, 20, 20)
@@ -127,25 +128,25 @@ def quick_compilation():
 
 @pytest.fixture(scope="module")
 def optimised_kernels():
-    """Kernels of nhjax as users have them, unlike what XLA compiles around them."""
+    """Optimise nhjax's kernels, as for users; XLA still compiles the rest quickly."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_program, "is_quick", lambda: False)
         yield
 
 
-# Of the 65530 memory maps that Linux gives a process by default.
+# By default Linux allows a process 65530 memory maps.
 MANY_MAPS = 40_000
 MAPS = Path("/proc/self/maps")
 
 
 @pytest.fixture(autouse=True, scope="module")
 def few_compiled_programs():
-    """Drop what was compiled once it holds many memory maps, which are limited.
+    """Drop compiled programs once they hold many memory maps, which are limited.
 
-    Until then small programs, such as an index into an array, serve all modules.
+    Until then, all modules share small programs, such as an index into an array.
     """
     yield
-    # Elsewhere than on Linux nothing tells how many there are.
+    # Only Linux shows how many maps a process has.
     if not MAPS.exists() or MAPS.read_bytes().count(b"\n") > MANY_MAPS:
         jax.clear_caches()
         gc.collect()
@@ -155,7 +156,7 @@ def few_compiled_programs():
     params=("lanes", "kernels", pytest.param("xla", marks=pytest.mark.long))
 )
 def engine(request, monkeypatch):
-    """The engine that compiles all programs; programs of others are forgotten."""
+    """The engine that compiles all programs; programs of other engines are dropped."""
     monkeypatch.setenv("NHJAX_ENGINE", request.param)
     jax.clear_caches()
     yield request.param

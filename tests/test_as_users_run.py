@@ -1,7 +1,7 @@
-"""Every feature in brief, with the flags of users and with all shapes checked.
+"""A short test of every feature, with the flags of users and all shapes checked.
 
-The other tests switch the compiler's optimisation off, and take annotations on trust.
-The checks act while programs are traced, and leave the programs as they are.
+The other tests switch the compiler's optimisation off, and do not check annotations.
+The checks act while programs are traced, and do not change the programs.
 """
 
 import os
@@ -18,13 +18,13 @@ pytestmark = pytest.mark.long
 
 
 QUICK = ("XLA_FLAGS", "JAX_DISABLE_MOST_OPTIMIZATIONS")
-# As errors, but what older releases of Zarr say while they are imported.
+# Warnings are errors, except those that older releases of Zarr emit when imported.
 WARNINGS = ("-W", "error", "-W", "default::DeprecationWarning:numcodecs")
 
 
 @pytest.fixture(scope="module")
 def lines():
-    """The lines that a program of its own prints, which runs all features."""
+    """The lines that a separate program prints; it runs all features."""
     env = {key: x for key, x in os.environ.items() if key not in QUICK}
     path = [str(Path(__file__).parent), env.get("PYTHONPATH", "")]
     env |= {"PYTHONPATH": os.pathsep.join(filter(None, path)), "MPLBACKEND": "Agg"}

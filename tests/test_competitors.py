@@ -21,7 +21,7 @@ from benchmarks import _heyoka
 
 
 PROBLEMS = problems()
-MEMBERS = 11  # no multiple of any number of lanes
+MEMBERS = 11  # not a multiple of any number of lanes
 THREADS = 2
 
 

@@ -1,4 +1,4 @@
-"""Of all forms of a competitor the fastest counts in the tables of the benchmarks."""
+"""The tables of the benchmarks contain the fastest form of each competitor."""
 
 import pytest
 
@@ -27,7 +27,7 @@ def test_contest_counts_the_fastest_form_of_each_competitor():
         }
     )
     first, second, third = contests(case)
-    # Half way between rungs in logarithms, nhjax takes 4 s, and 2 on devices.
+    # Half way between rungs in logarithms, nhjax takes 4 s, and 2 s on devices.
     best = second["best"]
     assert [*best] == [
         *("nhjax", "nhjax devices", "diffrax", "heyoka", "heyoka threads")
@@ -37,7 +37,7 @@ def test_contest_counts_the_fastest_form_of_each_competitor():
     assert best["heyoka"]["ratio_fastest"] == pytest.approx(4.0 / 8.0)
     assert second["others"]["method"] == "heyoka threads batch"
     assert second["others"]["ratio_seconds"] == pytest.approx(2.0 / 2.0)
-    # Where heyoka is not as accurate, diffrax is left, with another of its methods.
+    # Where heyoka is not as accurate, only diffrax is left, with another method.
     assert first["best"]["diffrax"]["method"] == "diffrax Tsit5 stacked"
     assert third["others"]["method"] == "diffrax Dopri8 vmap"
     ours, theirs = 4.0 ** (7 / 8), 4.0 * 4.0 ** (7 / 8)

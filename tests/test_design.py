@@ -1,4 +1,4 @@
-"""The page of the public interface names all that the interface has."""
+"""The page of the public interface names every part of the interface."""
 
 import ast
 import contextlib

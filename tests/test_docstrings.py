@@ -51,7 +51,7 @@ def test_docstring_example_prints_as_shown(example):
 def test_docstring_of_every_public_object_exists(name, value):
     text = value.__doc__ or ""
     assert text.strip(), name
-    # What Python would write in place of a docstring.
+    # Python generates such a text if there is no docstring.
     assert not text.startswith(f"{getattr(value, '__name__', name)}("), name
 
 

@@ -1,4 +1,4 @@
-"""The robots that come with nhjax, against dense equations of MuJoCo's matrices."""
+"""The robots that come with nhjax, against dense equations with MuJoCo's matrices."""
 
 import functools
 import importlib
@@ -77,7 +77,7 @@ def _rows(robot, model, data, qpos, qvel):
 
 
 def _dense_acceleration(robot, model, data, qpos, qvel):
-    """Solve M a = f + Jᵀ λ, J a = -J̇ v, with J̇ v from differences along the motion."""
+    """Solve M a = f + Jᵀ λ, J a = -J̇ v, with differences along the motion for J̇ v."""
 
     def rates(time):
         moved = qpos.copy()

@@ -10,7 +10,7 @@ from support.pages import blocks, page
 
 
 def _sections():
-    """The blocks of each section, after those that all of them begin with."""
+    """The opening blocks, which all sections need, and the blocks of each section."""
     opening, *sections = re.split(r"^## (.+)$", page("extending"), flags=re.MULTILINE)
     titles, texts = sections[::2], sections[1::2]
     return blocks(opening), dict(zip(titles, map(blocks, texts), strict=True))
@@ -26,7 +26,7 @@ def _run(title):
     return namespace
 
 
-# What the page asserts itself is the comparison with what nhjax has.
+# The page itself asserts the comparison with nhjax's own parts.
 @pytest.mark.parametrize("title", ["A group", "A retraction", "A method"])
 def test_own_group_retraction_or_method_on_the_page_runs(title):
     _run(title)

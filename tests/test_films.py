@@ -369,7 +369,7 @@ def test_render_with_invalid_argument_raises(changes, error, message):
 
 
 def test_render_of_states_that_miss_turns_of_a_wheel_raises():
-    # Between the states the wheel turns by 30 rad, but they say 30 rad less a turn.
+    # Between the states the wheel turns by 30 rad, which its angle does not show.
     ts = np.arange(4.0)
     turns = (30 - 2 * np.pi) * ts
     q = np.stack([30 * ts, 0 * ts, turns, 0 * ts], axis=1)
@@ -576,7 +576,7 @@ def test_view_serves_a_page_or_says_what_is_missing():
 
 
 def test_films_page_runs_as_printed(tmp_path, monkeypatch):
-    """Only the pictures are left out, which need OpenGL, and the browser."""
+    """Only the browser and the pictures, which need OpenGL, are left out."""
     import contextlib
 
     from nhjax._films import _render

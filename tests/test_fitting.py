@@ -1,4 +1,4 @@
-"""The notebooks that fit find the truth, within their error bars, at small size."""
+"""At small size, the fitting notebooks find the truth within their error bars."""
 
 import json
 from functools import cache
@@ -30,7 +30,7 @@ def test_fit_of_parameters_from_every_start_recovers_the_truth(results_of, fit):
     truth, estimates, bars = (
         np.array(results[key]) for key in ("truth", "estimates", "bars")
     )
-    # Bars that say something: a few percent of the parameter.
+    # The error bars are small: a few percent of the parameter.
     assert np.all(bars < 0.05 * truth)
     deviations = np.array(results["deviations_in_bars"])
     np.testing.assert_array_less(np.abs(estimates - truth), 3 * bars)
@@ -51,7 +51,7 @@ def test_learned_potential_is_as_accurate_as_noise_permits(results_of):
     loss = np.array(results["loss"])
     spread = np.sqrt(2 / results["num_data"])
     assert np.all(loss < 1 + 4 * spread)
-    # A fit of all weights to all data, were it linear, errs by σ √(P/n).
+    # A linear fit of all weights to all data would have the error σ √(P/n).
     assert np.all(np.array(results["held_out_errors"]) < 3 * results["expected_error"])
     bar = results["potential_bar"]
     assert bar < 0.1 * results["potential_size"]
@@ -70,7 +70,7 @@ def test_steering_reaches_the_pose_with_stationary_effort(results_of):
     results = results_of("steering_unicycle")
     assert np.all(np.array(results["misses"]) < 1e-6)
     assert np.all(np.array(results["fine_misses"]) < 1e-6)
-    # A step that ends the search is what the null space still has of the controls.
+    # The last step is the remaining part of the controls in the null space.
     assert np.all(np.array(results["last_steps"]) < 1e-3)
 
 
@@ -78,7 +78,7 @@ def test_rattleback_designed_by_gradient_reverses_its_spin(results_of):
     results = results_of("rattleback")
     assert results["first"] > 2
     assert results["last"] < -2
-    # The motion itself does, and not only its discretisation.
+    # The motion itself reverses, not only its discretisation.
     assert abs(results["mean_of_finer_run"] - results["last"]) < 0.1
     np.testing.assert_allclose(results["slope"], results["difference"], rtol=1e-4)
     assert results["smallest_force"] > 0

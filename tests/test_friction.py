@@ -152,7 +152,7 @@ ORDER_CASES = [
     ("nonholonomic", _lagrangian_form, 3, "symmetric", None),
     ("both", _lagrangian_form, 3, "symmetric", "full"),
     ("both", _hamiltonian_form, 3, "propagated", None),
-    # Each value of an argument with each value of each other one.
+    # Every pair of values of two arguments occurs.
     *(
         pytest.param(
             kind,
@@ -455,7 +455,7 @@ def test_friction_law_equals_its_formula_to_round_off_at_all_speeds(law):
 
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: type(law).__name__)
 def test_derivatives_of_friction_law_are_accurate_near_rest(law):
-    """The derivative of the slope by u² is smooth, from zero to beyond the series."""
+    """The derivative of the slope in u² is smooth, from zero to beyond the series."""
 
     def slope(square):
         return law.slope(square)
@@ -583,7 +583,7 @@ def _ball(no_slip, *forces_on):
     if no_slip:
         ball = rolling.Ellipsoid(_free_pose, 0.1, manifold=SE3)
     else:
-        # A torus whose tube is all of it has the shape of a ball.
+        # A torus whose core has the radius zero is a ball.
         ball = rolling.Wheel(_free_pose, 0.0, tube_radius=0.1, no_slip=(), manifold=SE3)
     contacts = rolling.Contacts(ball=ball)
     made: Any = sum(make(contacts) for make in forces_on)
@@ -740,7 +740,7 @@ def test_run_goes_on_with_friction_after_the_slip_event_as_in_the_closed_form():
     dt, num_steps = 2e-4, 3000
     sol = nhjax.integrate(sliding, method, y1, t0=t, dt=dt, num_steps=num_steps)
     end, duration = float(t) + dt * num_steps, dt * num_steps
-    # Up to u₀, the speed is that of Coulomb's law without smoothing.
+    # Up to an error of u₀, the speed follows Coulomb's law without smoothing.
     speed = float(at.v[0]) + 0.5 * G * duration
     np.testing.assert_allclose(_last(sol).v[0], speed, atol=2e-3)
     drive = 2.0 * (end**2 - float(t) ** 2) - 0.5 * MASS * G * RADIUS * duration
@@ -894,7 +894,7 @@ def test_contacts_with_another_number_of_multipliers_are_refused():
 
 @pytest.mark.parametrize("args", [{}, {"args": None}])
 def test_force_with_multipliers_and_default_args_receives_multipliers(args):
-    """Its fourth argument is called `multipliers`, also if there is a default."""
+    """A fourth argument called `multipliers` is found even if `args` has a default."""
 
     def force(t, q, v, multipliers, args=None):
         return -0.3 * jnp.abs(multipliers[0]) * jnp.tanh(v / 1e-3)

@@ -1,7 +1,7 @@
 """What users do wrong, as a table: the mistake, the error, and what its message says.
 
 A message names the argument or the function, says what was wrong, and what to do. The
-phrases stand in the message or in the notes below it. Further values of the same
+phrases occur in the message or in the notes below it. Further values of the same
 mistakes are in the tests of the rooms.
 """
 
@@ -53,7 +53,7 @@ from support.mistakes import (
 )
 
 
-# Mistakes are of wrong types, which is what a checker of types would say.
+# The type is Any because type checkers would report the wrong types of mistakes.
 NHJAX: Any = nhjax
 ANY_EVENT: Any = Event
 ANY_SAVEAT: Any = SaveAt

@@ -225,7 +225,7 @@ def test_plot_animation_backwards_in_time_follows_a_point(tmp_path):
     animation.save(tmp_path / "motion.gif", dpi=20)
     x, y = map(np.asarray, ax.lines[0].get_data())
     np.testing.assert_allclose((x, y), [[0, 0], [0, 1]])
-    # The end is up to three away, and the hub stays in the centre.
+    # The end is up to three units from the hub, which stays in the centre.
     np.testing.assert_allclose(ax.get_xlim(), (-3.15, 3.15))
     np.testing.assert_allclose(ax.get_ylim(), (-3.15, 3.15))
 

@@ -1,4 +1,4 @@
-"""Figures that pages quote are those of the committed results of the benchmarks."""
+"""Figures that pages quote agree with the committed results of the benchmarks."""
 
 import re
 

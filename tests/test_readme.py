@@ -1,4 +1,4 @@
-"""README keeps its word: its code runs as printed, and its commands are the CI's."""
+"""The README is right: its code runs as printed, and its commands are the CI's."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""What a result prints: its name with what to do, and for many runs how they ended."""
+"""A result prints its name and what to do; for many runs, how they ended."""
 
 import equinox as eqx
 import jax

@@ -442,7 +442,7 @@ def test_gradient_by_parameters_of_the_file_agrees_with_differences(name, chosen
     slopes, h = jax.jit(jax.grad(end))(robot.args), 1e-3
     leaves, structure = jax.tree.flatten(robot.args)
     for i, slope in enumerate(jax.tree.leaves(slopes)):
-        # A position is moved in all directions at once.
+        # All entries of a parameter change at once.
         def at(x, i=i):
             moved = [leaf + x if j == i else leaf for j, leaf in enumerate(leaves)]
             return end(structure.unflatten(moved))

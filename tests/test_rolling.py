@@ -83,7 +83,7 @@ def test_rattleback_from_parts_moves_like_that_of_the_gallery():
     system = _replaced(stone.system, contacts)
     _assert_same_motion(stone.system, system, stone.q0, stone.v0)
     y = nhjax.initial_state(system, stone.q0, stone.v0)
-    # The axes x and y of the plane are the directions, so that the multipliers agree.
+    # Both use the directions x and y of the plane, so that the multipliers agree.
     expected = stone.initial_state().multiplier
     np.testing.assert_allclose(y.multiplier, expected, atol=1e-11)
     np.testing.assert_allclose(contacts.forces(0.0, y)["stone"], expected, atol=1e-11)

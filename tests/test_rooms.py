@@ -1,4 +1,4 @@
-"""The rooms of nhjax: no import points up, and each room has one door."""
+"""The rooms of nhjax: imports only go down, and only to the `__init__` of a room."""
 
 import ast
 import re
@@ -38,7 +38,7 @@ def test_imports_between_modules_have_no_cycle():
 
 
 def test_imports_from_another_room_use_its_init():
-    """What is inside of a folder is imported from its `__init__` alone."""
+    """Names inside a folder are imported only from its `__init__`."""
     around = [
         f"{i.importer}:{i.line} -> {i.imported}"
         for i in rooms.between_rooms(IMPORTS)
@@ -74,7 +74,7 @@ def test_rooms_page_equals_generated_page():
     assert page == rooms.page(SOURCES), "run `python docs/rooms.py`"
 
 
-# A made-up package, to see that what must be found is found.
+# A made-up package, to test that forbidden imports are found.
 FLOORS = ("_low", "_high")
 
 
@@ -143,7 +143,7 @@ def test_import_cycle_is_detected():
     assert rooms.circle([*chain, ("c", "a")]) == ["a", "b", "c", "a"]
 
 
-# Parts of JAX and equinox that may go without notice.
+# Parts of JAX and equinox that may disappear without notice.
 INTERNAL = re.compile(
     r"\bjax\.(core|extend|interpreters|_src)\b|\bjaxlib\.|\.primitive\b"
     r"|\b(eqx|equinox)\.internal\b|xla_cpu_\w+|XLA_FFI|\._value\b|\.eqns\b"

@@ -28,7 +28,7 @@ OTHERS = (
 
 
 def _quoted():
-    """The parts of the messages in headings, without what varies."""
+    """The constant parts of the messages in headings."""
     for section in PAGE.split("\n## ")[1:]:
         if section.split("\n")[0] not in OTHERS:
             for heading in re.findall(r"^### (.*)$", section, re.MULTILINE):
@@ -37,7 +37,7 @@ def _quoted():
 
 
 def _written():
-    """The strings in the package, in which messages stand between values."""
+    """The strings in the package, which contain the constant parts of messages."""
     return "\n".join(
         node.value
         for path in sorted((ROOT / "nhjax").rglob("*.py"))

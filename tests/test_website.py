@@ -60,7 +60,7 @@ def test_website_external_files_and_missing_pictures_are_detected(tmp_path):
 
 @pytest.mark.parametrize("place", PAGES)
 def test_website_table_rows_have_as_many_cells_as_the_header(place):
-    # A bar ends a cell, as in |Φ|, also in code; the generator drops what is too much.
+    # A bar, as in |Φ|, ends a cell even in code; the generator drops surplus cells.
     for table in re.findall(r"(?:^\|.*\n)+", PAGES[place], re.MULTILINE):
         counts = {len(re.findall(r"(?<!\\)\|", row)) for row in table.splitlines()}
         assert len(counts) == 1, table
@@ -116,7 +116,7 @@ def test_website_gallery_shows_the_formulas_and_the_model_of_each_system():
         system, text = picture.example.system, "\n".join(shown)
         assert ("def constraint(" in text) == (system.nonholonomic is not None), name
         assert ("def holonomic(" in text) == (system.holonomic is not None), name
-        # The functions of the system are shown whole, so that some are longer.
+        # The functions of the system are shown in full, so some excerpts are longer.
         assert sum(x.count("\n") + 2 for x in shown) <= gallery.MODEL_LINES + 12, name
 
 

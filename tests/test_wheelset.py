@@ -130,7 +130,7 @@ def test_wheelset_satisfies_the_equations_at_first():
     )
     q, v = np.asarray(sol.ys.q), np.asarray(sol.ys.v)
     multiplier = np.asarray(sol.ys.multiplier)
-    # A wheel begins to slide after 2 ms, and the other after 4 ms: between these times.
+    # One wheel begins to slide after 2 ms, the other after 4 ms; k avoids both times.
     for k in (10, 20, 60, 200, 500, 790):
         a = STENCIL @ v[k - 4 : k + 5] / dt
         imbalance = _imbalance(q[k], v[k], a, multiplier[k])

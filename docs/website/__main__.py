@@ -21,7 +21,7 @@ HERE = Path(__file__).parent
 
 
 def main() -> None:
-    """Build the site, and serve it if that is asked for."""
+    """Build the site, and serve it if the command is `serve`."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -84,7 +84,7 @@ def _inline(value: Any) -> str:
 
 
 def complaints(site: Path) -> list[str]:
-    """List pictures that do not exist, and files that a page loads from elsewhere."""
+    """List pictures that do not exist, and files that a page loads from other sites."""
     found = []
     for path in sorted({*site.rglob("*.html")} - {site / "404.html"}):
         text = path.read_text(encoding="utf-8")

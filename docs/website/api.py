@@ -87,9 +87,9 @@ def pages() -> dict[str, dict[str, str]]:
 
 
 def links() -> dict[str, str]:
-    """Return the paths of public names by what stands in backquotes for them.
+    """Return the paths of public names, by the text in backquotes that refers to them.
 
-    A name without its module counts if it cannot be another word.
+    A name without its module refers to it unless it could be an ordinary word.
     """
     found = {"integrate": "nhjax.integrate"}
     for path, value in (pair for pairs in documented().values() for pair in pairs):

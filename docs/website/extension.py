@@ -21,14 +21,14 @@ MATHS = re.compile(
 )
 # A name of nhjax in backquotes, alone or called, that is not a link yet.
 NAME = re.compile(r"(?<![`\[])`(?P<name>[A-Za-z_][\w./]*)(?:\([^`]*\))?`(?!`)")
-# Lines such as `L = m/2 |v|² - V,`, and those that begin so.
+# Lines such as `L = m/2 |v|² - V,`, and the beginnings of such lines.
 END = re.compile(r"^[^`]* = [^`]*[,;]$")
 START = re.compile(r"\s*\S[^`.:]{0,24} = ")
 DOCTEST = re.compile(r"(?<!`pycon\n)^( *)>>> .*\n(?:.*\S.*\n)*", re.MULTILINE)
 
 
 class Doctests(Preprocessor):
-    """Fence examples with prompts, which docstrings indent."""
+    """Fence the examples with prompts, which are indented in docstrings."""
 
     def run(self, lines: list[str]) -> list[str]:
         """Fence the lines from a prompt to the next empty line, outside of fences."""
@@ -40,7 +40,7 @@ class Equations(Preprocessor):
     """Keep the line breaks between equations in plain text."""
 
     def run(self, lines: list[str]) -> list[str]:
-        """Break a line that ends an equation where the next one begins another."""
+        """Break a line that ends an equation if the next line begins another one."""
         following = [*lines[1:], ""]
         return [
             f"{line}  " if END.search(line) and START.match(after) else line
@@ -60,7 +60,7 @@ class Maths(Preprocessor):
             return match[0]
         display = "block" if match["block"] else "inline"
         maths = convert(match["block"] or match["inline"], display=display)
-        # A dot over a letter is too small to be seen, as browsers scale it.
+        # Browsers scale a dot over a letter, so that it is too small to be seen.
         maths = maths.replace("<mo>&#x002D9;</mo>", '<mo class="dot">&#x002D9;</mo>')
         if match["block"]:
             maths = f'<span class="formula" tabindex="0">{maths}</span>'
@@ -103,5 +103,5 @@ class SiteExtension(Extension):
 
 
 def makeExtension(**kwargs: Any) -> SiteExtension:
-    """Make the extension, as Python-Markdown asks for it."""
+    """Create the extension; Python-Markdown calls this function."""
     return SiteExtension(**kwargs)

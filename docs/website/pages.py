@@ -11,7 +11,7 @@ from markdown.extensions.toc import slugify
 
 
 ROOT = Path(__file__).parents[2]
-# Links between pages, and what becomes of them in the site.
+# Links between pages, and their replacements in the site.
 MOVED = (
     (r"\]\(\.\./benchmarks/results/", "](results/"),
     (r"\]\(\.\./notebooks/(\w+)\.ipynb", r"](notebooks/\1.md"),
@@ -34,7 +34,7 @@ def sources() -> dict[str, Path]:
 
 
 def write(folder: Path) -> None:
-    """Write all pages except those of the API into a folder."""
+    """Write all pages except the API pages into a folder."""
     for place, path in sources().items():
         target = folder / place
         target.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The arguments of classes whose fields are their arguments, for the pages of the API.
+"""The arguments of classes that take their fields as arguments, for the API pages.
 
 The generator reads the sources without importing them. It knows dataclasses, but
 not `equinox.Module`.
@@ -11,10 +11,10 @@ import griffe
 
 
 class ModuleFields(griffe.Extension):
-    """Give each subclass of `equinox.Module` the `__init__` that its fields make."""
+    """Give each subclass of `equinox.Module` an `__init__` that takes its fields."""
 
     def on_package(self, *, pkg: griffe.Module, **kwargs: Any) -> None:
-        """Mark the subclasses as dataclasses while `__init__` is made, not longer."""
+        """Mark the subclasses as dataclasses, but only while `__init__` is created."""
         marked = [made for made in _classes(pkg) if _has_fields(made)]
         for made in marked:
             mark = griffe.ExprName("dataclasses.dataclass")
@@ -44,7 +44,7 @@ def _classes(module: griffe.Module) -> Iterator[griffe.Class]:
 
 
 def _mark(field: griffe.Attribute) -> None:
-    """Let a field of Equinox look like one of `dataclasses`."""
+    """Make a field of Equinox look like a field of `dataclasses`."""
     value = field.value
     if isinstance(value, griffe.ExprCall) and str(value.function) == "eqx.field":
         value.function = griffe.ExprName("dataclasses.field")

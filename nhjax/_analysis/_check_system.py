@@ -140,10 +140,10 @@ def check_system(
     **Returns:** a `SystemReport`. The arguments on which functions depend are found
     from derivatives at three states near the given state.
 
-    **Raises:** the errors of `initial_state` for arguments, and for values returned by
-    the system's functions, that have a wrong type or shape or are not finite;
-    `ValueError` if a Lagrangian system is given `p`, or a Hamiltonian system is given
-    `v`; `TypeError` under `jit`, `vmap` or `grad`.
+    **Raises:** the errors of `initial_state` if arguments or values returned by the
+    system's functions have a wrong type or shape or are not finite; `ValueError` if a
+    Lagrangian system is given `p`, or a Hamiltonian system is given `v`; `TypeError`
+    under `jit`, `vmap` or `grad`.
 
     !!! example
 

@@ -93,11 +93,11 @@ def linear_stability(
     shift the motion in time or space and are excluded, so that A belongs to the reduced
     system. Without `symmetry`, X generates the translation that has the velocity of the
     state: a translation of ignorable coordinates, or a left translation of the group.
-    All velocities must be constant (body velocities on a group), or at least the chosen
-    independent velocities. For a bicycle on a circle, only chosen velocities are
-    constant.
+    All velocities (on a group, body velocities), or at least the chosen independent
+    velocities, must be constant. For a bicycle on a circle, only some velocities are
+    constant: choose these.
 
-    About any other motion, A is valid for an instant only, and its eigenvalues do not
+    About any other motion, A is valid only for an instant, and its eigenvalues do not
     decide stability. `steady_motion` finds steady motions.
 
     **Arguments:**
@@ -114,20 +114,20 @@ def linear_stability(
         on which the motion does not depend, such as the position of a wheel. By
         default, z consists of coordinates in an orthonormal basis of all perturbations
         that the constraints permit.
-    - `symmetry`: generators of symmetries, as vector fields like the generator of
-        `momentum_map`: called as `symmetry(q)`, of shape (n,) or (k, n), in the
-        components of the velocity. On a group, the generator of g -> g exp(εξ), a
-        symmetry of the body, is the constant ξ. The generator of g -> exp(εξ) g, a
-        symmetry of space, is `manifold.Ad(manifold.inverse(q), xi)`. The velocity must
-        be a combination of the generators. If one generator is a rotation and
-        another one a translation that it rotates, include the translations in all
-        directions that this rotation produces.
+    - `symmetry`: generators of symmetries: a function, like the `generator` of
+        `momentum_map`, that is called as `symmetry(q)` and returns vectors in the
+        components of the velocity, of shape (n,) or (k, n). On a group, the generator
+        of g -> g exp(εξ), a symmetry of the body, is the constant ξ. The generator of g
+        -> exp(εξ) g, a symmetry of space, is `manifold.Ad(manifold.inverse(q), xi)`.
+        The velocity must be a combination of the generators. If one generator is a
+        rotation and another is a translation that it rotates, include the translations
+        in all directions that this rotation produces.
     - `must_be_steady`: whether to raise if the motion is not steady. Pass False to
         linearise at an instant, for instance along a trajectory.
 
     **Returns:** a `LinearStability` with the matrix A, its eigenvalues and its modes,
     differentiable with respect to `y` and `args`. JAX computes the eigenvalues of a
-    nonsymmetric matrix on a CPU only.
+    nonsymmetric matrix only on a CPU.
 
     **Raises:** `TypeError` if `system` is not a system, `y` is not a `State`, or
     `symmetry` is not a function. `ValueError` if only one of `positions` and
@@ -192,10 +192,10 @@ def _drift_rates(
 ) -> BoundedResidual:
     """Compute the rates that vanish in a steady motion, and their bounds.
 
-    In a steady motion, the chosen coordinates are constant, or all velocities if none
-    are chosen. Their first and second time derivatives must vanish: when a pendulum
-    passes its lowest point, the first derivative of its velocity vanishes, but not the
-    second. The bounds allow for states that are accurate to a few digits only.
+    In a steady motion, the chosen coordinates are constant; if none are chosen, all
+    velocities are constant. Their first and second time derivatives must vanish: when a
+    pendulum passes its lowest point, the first derivative of its velocity vanishes, but
+    not the second. The bounds allow for states that are accurate to a few digits only.
     """
     dim = linearised.position_jacobian.shape[1]
     if independent is None:

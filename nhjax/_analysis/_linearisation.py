@@ -147,8 +147,8 @@ def linearise_along_symmetry(system, t, y, args, symmetry) -> LinearisedEquation
     steps = difference_steps(directions, state_size(y))
     moved = jnp.stack([steps, -steps], axis=1)[:, :, None] * directions[:, None, :]
     points = jnp.concatenate([zero[None], moved.reshape(-1, 2 * dim)])
-    # `map` compiles the function once for all points, which saves time because most of
-    # the time is compilation.
+    # `map` compiles the function once for all points, which saves time, because
+    # compilation takes most of the time.
     samples, values = jax.lax.map(at, points)
     number = 2 * dim * (1 + len(directions))
     jacobians = samples[0, :number].reshape(-1, 2 * dim, 2 * dim)
@@ -180,9 +180,9 @@ def rates_of_change(
 ) -> Callable[[Float[Array, " x"]], Float[Array, " x"]]:
     """Return the function x -> (v - v_0 - ad_v₀ ξ, u̇) of perturbations x = (ξ, w).
 
-    Its derivative at zero is the linearised equations of motion: in the frame of a body
-    that moves with v_0, a perturbation of the configuration changes at the rate
-    ξ̇ = δv - ad_v₀ ξ.
+    Its derivative at zero gives the linearised equations of motion: in the frame of a
+    body that moves with v_0, a perturbation of the configuration changes at the rate ξ̇
+    = δv - ad_v₀ ξ.
     """
     manifold = system.manifold_of(y.q)
     v0 = system.velocity(t, y.q, system.fibre_coordinate(y), args)
@@ -261,7 +261,7 @@ def orthonormal_basis(rows: Array, orbit: Array) -> PermittedPerturbations:
     """Compute an orthonormal basis of the kernel of `rows`, orthogonal to `orbit`.
 
     The vectors of `orbit` lie in the kernel themselves. The left inverse ignores the
-    components of a perturbation along them.
+    components of a perturbation along `orbit`.
 
     The basis is unique only up to a rotation, and the derivative of a singular value
     decomposition does not exist for equal singular values. Therefore the computed basis

@@ -187,8 +187,8 @@ def steady_motion(
         )
     check_symmetry(symmetry, y)
     outcome = solve_along_symmetry(system, t, y, args, symmetry, held, max_iterations)
-    # The check uses the compiled program of `linear_stability`. If the user calls this
-    # function next, it need not be compiled again.
+    # The check uses the compiled program of `linear_stability`, so that a later call of
+    # `linear_stability` does not compile it again.
     given = stop_gradient((system, t, outcome.state, args))
     conditions = _symmetry_conditions(
         linearise_along_symmetry(*given, symmetry), given[2]
@@ -315,7 +315,8 @@ def _phase_conditions(
 
     Steady motions that differ by symmetries form a family, and phase conditions select
     one member of it. A perturbation must be orthogonal to each row. Combinations of
-    generators that change held coordinates are omitted: they are excluded already.
+    generators that change held coordinates are omitted, because the held coordinates
+    already exclude them.
     """
     moved = directions[:, jnp.asarray(held, int)]
     unit = jnp.eye(directions.shape[0], dtype=directions.dtype)
@@ -374,8 +375,8 @@ def least_norm_root(
     - `residual`: the function whose root is computed.
     - `free`: 1 for each unknown that may change, and 0 for the others.
     - `start`: the values to which the unknowns are added.
-    - `groups`: the numbers of unknowns of each kind, in order. Unknowns of one kind
-        have the round-off of the largest of them.
+    - `groups`: the numbers of unknowns of each kind, in order. The round-off of an
+        unknown is proportional to the largest unknown of its kind.
     - `max_iterations`: the largest number of iterations.
 
     **Returns:** the root, the residual at the root, and the result of the iteration.
@@ -407,9 +408,9 @@ def least_norm_root(
 
     x, left = jax.lax.scan(refined, x, length=2)
     # An increment also vanishes if the free unknowns have no influence, so that the
-    # residual must be checked too. It is compared with the sum of the absolute
-    # derivatives, each times the size of its unknown. An unknown without influence has
-    # size zero.
+    # residual must be checked too. The residual is compared with the sum of the
+    # absolute derivatives, each times the size of its unknown. An unknown without
+    # influence has size zero.
     sizes = jnp.where(
         jnp.any(jacobian != 0, axis=0), jnp.abs(start) + jnp.abs(stop_gradient(x)), 0
     )

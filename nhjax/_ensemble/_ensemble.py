@@ -49,7 +49,7 @@ def ensemble(
 ) -> EnsembleOutcome:
     """Run a function for every member of an ensemble, in chunks of members.
 
-    This function computes `jax.vmap(run)(members)`, also for more members than fit into
+    This function computes `jax.vmap(run)(members)`, even for more members than fit into
     memory at a time. One compiled program runs all chunks and spreads the members of a
     chunk over all devices. The last chunk is padded with members that are ignored.
 
@@ -82,10 +82,10 @@ def ensemble(
         values of a member are large.
     - `devices`: the JAX devices to use, `jax.local_devices()` by default.
     - `fixed_order`: compute statistics in an order that does not depend on the number
-        of devices and processes. Two runs then have statistics that are equal bit for
-        bit, if the values of their members are. This order takes more time, because
-        each device reduces all members of a chunk, and processes wait for each other
-        after each chunk.
+        of devices and processes. Two runs then have bitwise equal statistics if their
+        members have bitwise equal values. This order takes more time, because each
+        device reduces all members of a chunk, and processes wait for each other after
+        each chunk.
     - `progress_meter`: shows the number of finished members; by default a bar on the
         standard error stream if that is a terminal.
     - `resume`: whether to resume the run of an existing store; if False, an existing

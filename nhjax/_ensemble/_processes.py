@@ -13,7 +13,7 @@ from jax.experimental.multihost_utils import process_allgather
 
 
 # Data are padded to vectors whose length is a power of two and at least this number of
-# bytes. JAX compiles a program for each length, so that this saves compilations.
+# bytes. This saves compilations, because JAX compiles a program for each length.
 _MIN_BYTES = 1024
 # The time between two collective operations while processes run separate chunks. On the
 # CPU, a collective operation fails after a process has waited for 30 minutes.

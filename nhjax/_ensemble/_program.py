@@ -341,9 +341,9 @@ def _run_members(run: Any, make: Any, inputs: Any, layout: Layout) -> Any:
 
     every = jax.vmap(member)
     if len(layout.devices) > 1:
-        # Members are independent, so that the result is right without JAX's check of
-        # values that vary between devices (`check_vma`). This check does not know the
-        # primitives that nhjax adds.
+        # JAX's check of values that vary between devices (`check_vma`) is off, because
+        # it does not know the primitives that nhjax adds. Members are independent, so
+        # that the result is right without this check.
         every = _on_each_device(layout, every, jax.P(AXIS), jax.P(AXIS))
     return every(inputs)
 

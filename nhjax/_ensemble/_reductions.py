@@ -2,8 +2,8 @@
 
 A reduction has a state of fixed size. `update` adds the members of a chunk to a state,
 `merge` combines the states of two sets of members, and `finish` computes the statistic.
-Sums are computed in double-double arithmetic, so that another size of the chunks
-changes at most the last bit of the result.
+Sums are computed in double-double arithmetic, so that the size of the chunks affects at
+most the last bit of the result.
 """
 
 import math
@@ -107,8 +107,8 @@ class Variance(AbstractReduction):
     The variance is Σ (x_j - mean)² / (n - ddof), computed by the update of Chan, Golub
     and LeVeque (1983, *Algorithms for computing the sample variance*). For one
     additional member this is Welford's update. Let two sets have n_a and n_b members,
-    n = n_a + n_b, sums of squares about their means S_a and S_b, and the difference of
-    means δ = mean_b - mean_a. Then
+    and the sums of squares S_a and S_b about their means. With δ = mean_b - mean_a and
+    n = n_a + n_b,
 
     mean = mean_a + δ n_b/n,   S = S_a + S_b + δ² n_a n_b/n.
 
@@ -193,7 +193,7 @@ class Variance(AbstractReduction):
 class _AbstractExtreme(AbstractReduction):
     """The smallest or the largest of the values of members, chosen by `best`.
 
-    No value is worse than `worst`, with which the comparison starts.
+    The comparison starts with `worst`, which is not better than any value.
     """
 
     worst: eqx.AbstractClassVar[float]

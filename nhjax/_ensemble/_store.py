@@ -43,9 +43,10 @@ _BATCH = ("trajectory",)
 class ZarrSink(AbstractSink):
     """Writes the values of members to a store of Zarr, with a journal of chunks.
 
-    A chunk is finished when its files and then its line of the journal are on the disk.
-    The line has the number of the chunk, its failures, and a checksum of each file.
-    Process 0 creates the store and its journal; every process writes its own chunks.
+    A chunk is finished when its files, and after them its line of the journal, are on
+    the disk. The line has the number of the chunk, its failures, and a checksum of each
+    file. Process 0 creates the store and its journal; every process writes its own
+    chunks.
     """
 
     MANIFEST = "manifest/zarr.json"
@@ -204,7 +205,7 @@ class ZarrSink(AbstractSink):
         content |= {self.PROGRAM: self.program.encode(), self.JOURNAL: b""}
         for name, data in content.items():
             durable.write(unfinished / name, data)
-        # The complete store gets its name in one operation.
+        # When the store is complete, it gets its final name in one operation.
         os.replace(unfinished, self.path)
         durable.sync_folder(self.path.parent)
 
@@ -422,7 +423,7 @@ def _check_same_job(
 def _differences(
     old: dict[str, Any], new: dict[str, Any], is_complete: bool
 ) -> list[str]:
-    """List the differences of two manifests; ignore versions of a complete run."""
+    """List the differences of two manifests, without versions if `is_complete`."""
     words = {
         "members": "the arrays of `members`, or whether `members` is a function",
         "variables": "the names, shapes or dtypes of what `run` returns",
@@ -511,7 +512,7 @@ def _attributes(
 
 
 def _digest_of_common_times(variables: dict[str, Any]) -> str | None:
-    """Compute a digest of the times of members, or None unless all are the same."""
+    """Compute a digest of the members' times, or return None if they differ."""
     if "t" not in variables:
         return None
     times = variables["t"][1]

@@ -328,8 +328,8 @@ def _write_gif(
     sheet = image.new("RGB", (size[0], size[1] * len(some)))
     for k, picture in enumerate(some):
         sheet.paste(picture, (0, k * size[1]))
-    # 176 colours of the palette are the most frequent ones. The other 80 are chosen for
-    # their distance, so that small parts keep their colours.
+    # 176 colours of the palette are the most frequent ones. The other 80 cover the
+    # range of all colours, so that small parts keep their colours.
     frequent = sheet.quantize(176, image.Quantize.MEDIANCUT).getpalette()
     apart = sheet.quantize(80, image.Quantize.MAXCOVERAGE).getpalette()
     palette = image.new("P", (1, 1))

@@ -48,7 +48,7 @@ def subject_of(who: str, machine: Any) -> Subject:
     except ValueError as error:
         raise ValueError(f"{who}: MuJoCo cannot read the `mjcf`: {error}") from error
     for body in spec.worldbody.bodies:
-        # The function `poses` places the bodies, not dynamics.
+        # The function `poses` places the bodies, without dynamics.
         body.mocap = True
     system = getattr(machine, "system", None)
     own = getattr(system, "manifold", None)
@@ -60,8 +60,8 @@ class Scene:
 
     - `times`: the times, of shape (k,).
     - `centres`: the points at which the camera of a film looks, of shape (k, 3).
-    - `reach(centres)`: the common radius of balls about the given centres, one for each
-        time, that contain the machine.
+    - `reach(centres)`: the radius at which the balls about the given centres (one for
+        each time) contain the machine.
     - `trails`: the paths to draw, of shape (paths, k, 3).
     """
 
@@ -231,8 +231,8 @@ class Scene:
     def place(self, k: int) -> None:
         """Put the bodies and the light where they are at the k-th time."""
         if self._light is not None:
-            # A directional light casts shadows only up to a distance from its position.
-            # Therefore it moves with the machine.
+            # A directional light casts shadows only up to some distance from its
+            # position. Therefore it moves with the machine.
             distance = 5 * self.model.stat.extent
             self.model.light_pos[self._light] = self.centres[k] - distance * LIGHT
         self._move(self.model, self.data, k)
@@ -286,15 +286,15 @@ def _add_ground(mujoco: Any, spec: Any, height: float, size: float) -> None:
         size=[0, 0, cell],
         pos=[0, 0, height],
         material="nhjax ground",
-        # These are set because the defaults of the model may set a colour, or a group
-        # that is not drawn.
+        # Colour and group are set, because the defaults of the model may have another
+        # colour, or a group that is not drawn.
         rgba=PLAIN,
         group=0,
     )
 
 
 def round_length(size: float) -> float:
-    """Return the largest of 1, 2 and 5 times a power of ten, at most `size`."""
+    """Return the largest number <= `size` that is 1, 2 or 5 times a power of ten."""
     power = 10.0 ** np.floor(np.log10(size))
     return float(power * max(x for x in (1, 2, 5) if x * power <= 1.000001 * size))
 

@@ -71,14 +71,14 @@ def initial_state(
     keep_p: Chosen = None,
     throw: bool = True,
 ) -> State:
-    """Create a consistent state (q, v, p, λ) from a configuration and a v or p.
+    """Create a consistent state (q, v, p, λ) from q and either v or p.
 
-    You give the velocity or the momentum; the other of the two follows from the
-    Legendre transform p = D2L or v = D2H. The multiplier is the multiplier of the
-    continuous problem. It follows from the hidden constraints: dΦ/dt = 0 for
-    nonholonomic and d²Γ/dt² = 0 for holonomic constraints. With an inconsistent initial
-    multiplier λ_0, a method with the closure `"propagated"` has in general only order
-    2, for any number of stages.
+    You give the velocity or the momentum; the other one follows from the Legendre
+    transform p = D2L or v = D2H. The multiplier is the multiplier of the continuous
+    problem. It follows from the hidden constraints: dΦ/dt = 0 for nonholonomic and
+    d²Γ/dt² = 0 for holonomic constraints. With an inconsistent initial multiplier λ_0,
+    a method with the closure `"propagated"` has in general only order 2, for any number
+    of stages.
 
     **Arguments:**
 
@@ -87,7 +87,7 @@ def initial_state(
         product of groups a tuple of elements.
     - `v`, `p`: velocity or momentum, shape (n,) with n the dimension of the manifold,
         of the dtype of q; on a group in the body frame. Give exactly one.
-    - `t`, `args`: passed on to the functions of the system, as `integrate` does.
+    - `t`, `args`: passed on to the functions of the system, as in `integrate`.
     - `project`: whether to replace q by the nearest configuration, and then v by the
         nearest velocity, that satisfies the constraints. Distances are measured in the
         kinetic metric. The velocity needs one linear solve if the constraints are
@@ -96,14 +96,14 @@ def initial_state(
         not change: an index, a name or a sequence of them, known when tracing. Use
         `keep_v` with `v`, and `keep_p` with `p`. The projection then finds the nearest
         values of the other components, in the same metric, that satisfy the
-        constraints. An index is a position in the flattened `q` (for a tuple, in all
-        its parts joined in order) or in `v` or `p`. A name is an entry of the
+        constraints. An index counts the numbers of the flattened `q` (for a tuple, of
+        all its parts joined in order) or of `v` or `p`. A name is an entry of the
         `coordinates` of the system. If the kept components determine a constraint and
         violate it, the error names the constraint and these components.
     - `throw`: whether to raise if there is no consistent state. If false, all numbers
-        of the state are then NaN, and `integrate` reports the state as not finite;
-        under `vmap` the other members of an ensemble are not affected. Wrong types and
-        shapes raise in both cases.
+        of the returned state are then NaN, and `integrate` reports the state as not
+        finite; under `vmap` the other members of an ensemble are not affected. Wrong
+        types and shapes raise in both cases.
 
     **Returns:** a `State`.
 

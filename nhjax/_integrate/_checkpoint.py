@@ -42,19 +42,18 @@ class Checkpoint(eqx.Module):
     - `dt`: the step size.
     - `num_steps`: the number of steps taken since `t0`.
     - `clock`: the data of the `stepsize_controller`; empty after a run with constant
-        steps. After a run whose steps differ in size, `t0` is the end of the run, and
+        steps. After a run with variable steps, `t0` is the end of the run, and
         `num_steps` is zero.
 
     Under `vmap` every array has the batch as its leading axis. Derivatives pass through
     `state`, `t0` and `dt`.
 
-    The bits of a result depend on the compiled instructions. A run in parts repeats a
-    run in one piece bit for bit if all these runs save the same output, and use the
-    same releases of JAX and nhjax on the same machine. Under `jit` the run in one piece
-    must also save a checkpoint, because all parts except the last save one. Otherwise
-    the results agree up to round-off. Dense output and the samples of `SaveAt(ts=...)`
-    also agree only up to round-off, because each part counts their times from its own
-    start.
+    The bits of a result depend on the compiled instructions. A run in parts equals a
+    run in one piece bit for bit if all runs save the same output and use the same
+    releases of JAX and nhjax on the same machine. Under `jit` the run in one piece must
+    also save a checkpoint, because all parts except the last save one. Otherwise the
+    results agree up to round-off. Dense output and the samples of `SaveAt(ts=...)` also
+    agree only up to round-off, because each part counts their times from its own start.
 
     !!! example
 

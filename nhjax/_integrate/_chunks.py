@@ -25,7 +25,7 @@ from ._checkpoint import MOST_STEPS
 from ._progress_meter import AbstractProgressMeter
 
 
-# The count of numbers in the buffers of a chunk, and the limits of their count of rows.
+# How many numbers the buffers of a chunk hold, and the limits of their number of rows.
 _BUFFER_SIZE = 2**17
 _LEAST_ROWS, _MOST_ROWS = 16, 4096
 # Unless a progress meter sets the lengths of chunks, the first chunk has at most

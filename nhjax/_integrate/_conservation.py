@@ -54,8 +54,8 @@ def kept_invariants(
     """Return the invariants that a run keeps, with their values at the initial state y.
 
     Raise a `TypeError` if `invariants` is not None, "energy" or a function. Raise a
-    `ValueError` if the functions of the system alone show that it does not conserve its
-    energy; the message gives the reason.
+    `ValueError` for "energy" if the system has a force or depends on time; the message
+    gives the reason.
     """
     if invariants is None:
         return None

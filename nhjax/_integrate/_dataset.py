@@ -93,8 +93,8 @@ def named_arrays(value: Any, batch: tuple[str, ...]) -> dict[str, Any]:
     **Returns:** a dictionary from names to pairs of the dimensions, starting with
     `batch`, and the array.
     """
-    # Only a `Solution` has `stats`. This module cannot import the class, because the
-    # module of the class imports this module.
+    # Only a `Solution` has `stats`. The class itself cannot be imported here, because
+    # its module imports this module.
     if not hasattr(value, "stats"):
         return _named(value, batch, "value", None)
     made = {} if value.ts is None else _saved(value.ys, (*batch, "time"))
@@ -149,7 +149,7 @@ def _result_names(result: Any) -> np.ndarray:
 
 
 def _saved(ys: Any, dims: tuple[str, ...]) -> dict[str, Any]:
-    """Name the saved arrays and those of their axes that follow the axes `dims`."""
+    """Name the saved arrays, and their axes after the axes `dims`."""
     if not isinstance(ys, State):
         return _named(ys, dims, "value", None)
     of = ys.v.shape[-1:]
@@ -164,8 +164,8 @@ def _named(
 ) -> dict[str, Any]:
     """Name the leaves of a tree by their paths, such as q0 and q1 for a tuple q.
 
-    An array whose shape after the axes `dims` is `coordinates` has the axis
-    "coordinate".
+    If the tree is a single array whose shape, after the axes `dims`, is `coordinates`,
+    its last axis is "coordinate".
     """
     made = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):

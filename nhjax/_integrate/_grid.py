@@ -43,7 +43,7 @@ class TimeGrid(eqx.Module):
 
 
 class VariableGrid(eqx.Module):
-    """The nodes of a run whose steps differ in size.
+    """The nodes of a run with variable steps, that is, steps of different sizes.
 
     - `dt`: the step size that the user gave, or None.
     - `t1`: the end, or None for a run of `num_steps` steps.
@@ -101,7 +101,7 @@ def variable_grid(
     num_steps: Any,
     max_steps: int | None,
 ) -> tuple[AbstractStepSizeController, VariableGrid, list[Check]]:
-    """Return the controller, the nodes and the checks of a run whose steps differ.
+    """Return the controller, the nodes and the checks of a run with variable steps.
 
     **Raises:** `TypeError` and `ValueError` for arguments that cannot be combined.
     """
@@ -154,7 +154,7 @@ def variable_grid(
     checks += controller.checks()
     if most is None:
         most = _default_limit(controller, t0, size, end, number)
-    # Tolerances are passed as arrays, so that other values do not recompile.
+    # Tolerances are passed as arrays, so that changing them does not recompile.
     known, rest = eqx.partition((controller, direction), _is_known_number)
     known = jax.tree.map(lambda x: np.asarray(x, dtype), known)
     with jax.ensure_compile_time_eval():
@@ -175,7 +175,7 @@ def _is_known_number(x: Any) -> bool:
 def _numbers(
     t1: Any, num_steps: Any, max_steps: Any, is_given: bool
 ) -> tuple[int | None, int | None]:
-    """Return the number of steps and the limit of attempts, where they are given."""
+    """Return the number of steps and the limit of attempts, if they are given."""
     if t1 is not None and is_given:
         raise ValueError(
             "`t1` is given together with an array `dt`, which gives all steps. Leave "
@@ -229,7 +229,7 @@ def _default_limit(
 def checks_of_output(
     saveat: SaveAt, grid: VariableGrid, controller: AbstractStepSizeController
 ) -> list[Check]:
-    """Return the checks of `SaveAt(ts=...)` in a run whose steps differ."""
+    """Return the checks of `SaveAt(ts=...)` in a run with variable steps."""
     if saveat.ts is None:
         return []
     end = grid.t1

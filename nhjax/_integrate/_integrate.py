@@ -193,10 +193,10 @@ def integrate(
     - `saveat`: the output to save, the final state by default; see `nhjax.SaveAt`.
     - `stage_solver`: how the equations of a step are solved,
         `nhjax.SimplifiedNewton()` by default, or `nhjax.Newton()`.
-    - `stepsize_controller`: how the sizes of the steps are chosen: all equal to `dt` by
-        default, or `nhjax.PIDController(rtol, atol)`, which keeps an estimated error
-        below a tolerance, or `nhjax.ReversibleController(eps, density)`. Derivatives
-        treat the sizes that a controller chooses as constants.
+    - `stepsize_controller`: how the sizes of the steps are chosen. By default all are
+        equal to `dt`. `nhjax.PIDController(rtol, atol)` keeps an estimated error below
+        a tolerance. A third choice is `nhjax.ReversibleController(eps, density)`.
+        Derivatives treat the sizes that a controller chooses as constants.
     - `max_steps`: the largest number of attempts at a step in a run to `t1`, an int.
         The default is 4096, or the number of steps that the run needs if the steps are
         constant and this number is known when tracing. Under `jit`,
@@ -210,11 +210,11 @@ def integrate(
         batch are not affected.
     - `progress_meter`: the meter that shows how many steps are done, such as
         `nhjax.TqdmProgressMeter()`.
-    - `invariants`: quantities that the steps conserve to round-off at their values in
-        `y0`: `"energy"`, or a function that returns shape () or (k,). The function is
-        called with (t, q, v, args), or (t, q, p, args) for a Hamiltonian system. The
-        system itself must conserve these quantities.
-        `docs/invariants.md` describes the method, its cost and its behaviour at rest.
+    - `invariants`: quantities that the steps keep at their values in `y0`, up to
+        round-off: `"energy"`, or a function that returns shape () or (k,). The function
+        is called with (t, q, v, args), or (t, q, p, args) for a Hamiltonian system. The
+        system itself must conserve these quantities. `docs/invariants.md` describes the
+        method, its cost and its behaviour at rest.
     - `event`: an `nhjax.Event`, or a sequence of events. An event is a zero of a
         function of the state, at which the run ends or the state is reset. If a step
         has several events, the earliest is handled first.
@@ -230,13 +230,13 @@ def integrate(
 
     !!! note
 
-        Outside of transformations, the host calls a compiled program that takes a chunk
-        of steps. Another `num_steps`, `SaveAt(steps=k)`, `adjoint` or `progress_meter`
-        does not recompile. The first run with `ts` or `dense` compiles programs that
-        also store the stage values from which the output between steps is computed.
-        Ctrl-C ends a run after the current chunk, within about a fifth of a second:
-        `integrate` warns and returns the solution up to the end of this chunk, with the
-        `result` `nhjax.RESULTS.interrupted`.
+        Outside of JAX transformations, the host calls a compiled program that takes a
+        chunk of steps. Changing `num_steps`, `SaveAt(steps=k)`, `adjoint` or
+        `progress_meter` does not recompile it. The first run with `ts` or `dense`
+        compiles programs that also store the stage values from which the output between
+        steps is computed. Ctrl-C ends a run after the current chunk, within about a
+        fifth of a second: `integrate` warns and returns the solution up to the end of
+        this chunk, with the `result` `nhjax.RESULTS.interrupted`.
 
         Under `jit` an int `num_steps` is static. An integer array is traced, and under
         `vmap` each member may have its own number of steps. With an array, `saveat`
@@ -248,7 +248,7 @@ def integrate(
 
         The functions of `system` and `saveat` may read globals and variables of
         enclosing functions, which become constants of the compiled program. Outside of
-        transformations, a call traces the functions again if one of these has changed.
+        transformations, a call traces the functions again if such a value has changed.
         See `nhjax.LagrangianSystem` for the tracked values, and for calls inside your
         own `jax.jit`.
 

@@ -57,7 +57,7 @@ def interpolate(
 class DenseInterpolation(eqx.Module):
     """The collocation polynomials of a whole trajectory, one for each of its steps.
 
-    They are defined from t0 to t0 + num_steps dt or, if the steps differ, to the end of
+    They are defined from t0 to t0 + num_steps dt or, with variable steps, to the end of
     the run. `integrate` creates an instance if `SaveAt(dense=True)` is given; users
     evaluate the polynomials by `Solution.evaluate`.
     """
@@ -67,7 +67,7 @@ class DenseInterpolation(eqx.Module):
     t0: FloatScalar
     dt: FloatScalar
     records: StepRecord
-    # The number of steps whose records are valid, in a run whose steps differ.
+    # The number of steps whose records are valid, in a run with variable steps.
     count: Int[Array, ""] | None
     # The system and args are stored as a list of their arrays, a tuple of their other
     # leaves and the structure of the tree, because `jax.jit` and `jax.vmap` cannot
@@ -140,7 +140,7 @@ def _outside_of_steps(t: np.ndarray, t0: np.ndarray, t1: np.ndarray) -> ValueErr
 def is_within(
     t: Float[Array, "*k"], t0: FloatScalar, t1: FloatScalar
 ) -> Bool[Array, "*k"]:
-    """Return which times lie between t0 and t1, or outside by round-off only."""
+    """Return which times lie between t0 and t1, or outside only by round-off."""
     slack = 8 * float(jnp.finfo(t.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
     least, most = jnp.minimum(t0, t1) - slack, jnp.maximum(t0, t1) + slack
     return (t >= least) & (t <= most)
@@ -151,7 +151,7 @@ def step_among(
     interval: tuple[Float[Array, " k"], Float[Array, " k"]],
     count: Int[Array, ""] | int,
 ) -> Int[Array, ""]:
-    """Find the index of the step that contains the time t, among steps that differ.
+    """Find the index of the step that contains the time t, among variable steps.
 
     `interval` has the starts and the sizes of the steps, of which the first `count` are
     valid.

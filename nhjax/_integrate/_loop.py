@@ -26,8 +26,8 @@ from ._stepper import AbstractCarry, AbstractStepper, StepResult
 class Loop(eqx.Module):
     """The time loop of a run: its stepper, its output, and its progress meter.
 
-    An adjoint calls `step` for k = 0, ..., num_iterations - 1 in order, and calls
-    `write` to put the rows that each iteration returns into buffers, which start as
+    An adjoint calls `step` for k = 0, ..., num_iterations - 1 in order. After each
+    iteration it calls `write` to put the returned rows into buffers, which start as
     `empty_rows`.
     """
 
@@ -218,12 +218,13 @@ class DirectAdjoint(AbstractAdjoint):
 class RecursiveCheckpointAdjoint(AbstractAdjoint):
     """Store some states on the way, recompute the rest: memory O(sqrt(num_steps)).
 
-    The steps are divided into `checkpoints` blocks, and each block again, until a block
-    has at most `checkpoints` steps. The reverse pass works in one block of each level
-    at a time. For this block it stores the states at the starts of the blocks of the
-    next level. In a block of the last level, it stores the stages of all steps. The
-    default is two levels. Each level beyond the first costs another forward run. With L
-    levels and num_steps = checkpoints^L the memory is O(L checkpoints).
+    The steps are divided into `checkpoints` blocks, and each block is divided in the
+    same way, until a block has at most `checkpoints` steps. The reverse pass works in
+    one block of each level at a time. For this block it stores the states at the starts
+    of the blocks of the next level. In a block of the last level, it stores the stages
+    of all steps. The default is two levels. Each level beyond the first costs another
+    forward run. With L levels and num_steps = checkpoints^L the memory is
+    O(L checkpoints).
 
     Forward mode, second derivatives and an array `num_steps` work as with
     `DirectAdjoint`.

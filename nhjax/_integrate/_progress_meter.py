@@ -30,9 +30,10 @@ class AbstractProgressMeter(eqx.Module):
         """
 
     def update_part(self, percent: int) -> None:
-        """Show which part of the run is done, if the number of steps is not known.
+        """Show the percentage of the run's time that is done.
 
-        The loop calls this method when the percentage of the run's time has increased.
+        If the number of steps is not known, the loop calls this method each time the
+        percentage has increased.
         """
         self.update(percent, 100)
 
@@ -66,12 +67,12 @@ class AbstractProgressMeter(eqx.Module):
     def report_part(self, before: FloatScalar, after: FloatScalar) -> None:
         """Report from inside a traced loop that a part of the run is done.
 
-        The parts before and after a step are numbers from 0 to 1. For a batch, the
-        part of its slowest member is reported.
+        `before` and `after` are the parts that are done before and after a step, from 0
+        to 1. For a batch, the part of its slowest member is reported.
         """
         if self.silent:
             return
-        # The members of a batch have different parts, and are reported as one run.
+        # The members of a batch differ in progress, but are reported as one run.
         old, new = (_least((100 * x).astype(jnp.int32)) for x in (before, after))
 
         def callback(percent):
@@ -193,7 +194,7 @@ class TqdmProgressMeter(AbstractProgressMeter):
 
 
 class _Printed:
-    """The last tenth of a run that was printed.
+    """The tenth of a run that was printed last.
 
     All instances are equal, so that `jax.jit` does not recompile for each instance.
     """
@@ -209,7 +210,7 @@ class _Printed:
 
 
 class _Open:
-    """The open bars of a meter, by the number of steps of their runs.
+    """The open bars of a meter; the keys are the numbers of steps of their runs.
 
     The bars are state on the host. All instances are equal and have the same hash, so
     that `jax.jit` does not recompile a program for each instance.

@@ -26,12 +26,12 @@ class ReversibleAdjoint(AbstractAdjoint):
     step of -h leads back only up to a small error. In these cases an iteration that
     starts from the step of -h inverts the step.
 
-    The retraced states differ from the states of the run by round-off. If the motion is
-    attracted to a set, like the motion of a sleigh, the set repels the motion in
-    reversed time, and the differences grow as fast as the motion decays. In that case
-    prefer `RecursiveCheckpointAdjoint`. This adjoint allows reverse mode and forward
-    over reverse mode only: `jax.jvp` needs one of the other two adjoints. This adjoint
-    computes gradients also if `num_steps` is an array.
+    The retraced states differ from the states of the run by round-off. If a set
+    attracts the motion, as for a sleigh, it repels the motion in reversed time, and the
+    differences grow as fast as the motion decays. In that case prefer
+    `RecursiveCheckpointAdjoint`. This adjoint allows only reverse mode and forward over
+    reverse mode: `jax.jvp` needs one of the other two adjoints. Gradients are also
+    available if `num_steps` is an array.
 
     !!! example
 
@@ -60,8 +60,8 @@ def _run(arguments: tuple[Loop, AbstractCarry]) -> tuple[AbstractCarry, Rows]:
 @_run.def_fwd
 def _run_fwd(perturbed, arguments):
     del perturbed
-    # `_run` has a custom rule for reverse mode, so that calling it here would rule out
-    # forward mode over this reverse mode.
+    # Calling `_run` here would rule out forward mode over this reverse mode, because
+    # `_run` has a custom rule for reverse mode.
     carry, rows = DirectAdjoint().run(*arguments)
     # The backward pass needs only the shapes of the buffers, and the log.
     shapes = jax.eval_shape(lambda: rows)

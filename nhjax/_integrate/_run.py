@@ -143,8 +143,8 @@ def run(
     is_variable, sampled = isinstance(grid, VariableGrid), None
     if not isinstance(grid, VariableGrid):
         sampled = _sampled_steps(saveat, grid)
-    # If the steps differ, it is not known before the run which steps contain the times
-    # `ts`, so that the records of all steps are kept.
+    # With variable steps, it is not known before the run which steps contain the times
+    # `ts`. Therefore the records of all steps are kept.
     keeps_all = saveat.dense or (is_variable and saveat.ts is not None)
     places = record_places(keeps_all, sampled, most)
     saving = Saving.of(saveat, fn, most, places, stepper.log_length)
@@ -245,7 +245,7 @@ class _Start(NamedTuple):
     - `noise`: the round-off of the functions of the system.
     - `saved`: the output of the initial state, if it is asked for.
     - `surplus`: the number of iterations that the run may need in addition to one for
-        each step; in a run whose steps differ, the number of all iterations.
+        each step; in a run with variable steps, the number of all iterations.
     - `room`: the number of rows of the buffers of a chunk.
     """
 
@@ -269,7 +269,7 @@ class _Chunk(NamedTuple):
     - `system`: the system for the interpolation of records, if there are any.
     - `stats`: the statistics of the solution.
     - `is_over`, `progress`: whether the run has ended, and the part of the run that is
-        done; both only if the steps differ in size.
+        done; both only with variable steps.
     """
 
     carry: AbstractCarry
@@ -298,8 +298,8 @@ def _started(
     saves_start: BoolScalar,
 ) -> _Start:
     """Return the start of a run in chunks."""
-    # The start does not depend on the number of steps. With zero steps, the number of
-    # iterations is the surplus.
+    # The start does not depend on the number of steps. This number is set to zero, so
+    # that the number of iterations is the surplus.
     none = jnp.zeros((), jnp.int32)
     grid = grid.of_length(none)
     stepper, fn = _stepper(system, method, y0, grid, args, options, stage_solver)
@@ -432,7 +432,7 @@ def _samples(
     stage_solver: AbstractStageSolver,
     samples: tuple[Float[Array, " k"], Int[Array, " k"], StepRecord],
 ) -> PyTree[Array]:
-    """Compute the output at times inside steps, whose indices and records are given."""
+    """Compute the output at times inside steps with given indices and records."""
     none = jnp.zeros((), jnp.int32)
     grid = grid.of_length(none)
     stepper, fn = _stepper(system, method, y0, grid, args, options, stage_solver)
@@ -465,7 +465,7 @@ def run_in_chunks(
     saves_start = jax.device_put(np.array(saveat.t0))
     start = _started(*given, saves_start, captured=captured)
     if not all(isinstance(x.dtype, np.dtype) for x in jax.tree.leaves(start.saved)):
-        # NumPy has no arrays of random keys, so that chunks cannot return this output.
+        # Chunks cannot return random keys, because NumPy has no arrays of them.
         return run(system, method, y0, whole, args, options, saveat, solver_options)
 
     def chunk(carry: AbstractCarry, log: Any, span: Array) -> _Chunk:
@@ -492,7 +492,7 @@ def run_in_chunks(
     if output.saved is not None:
         pieces.append(output.saved)
     elif saveat.steps:
-        # The run has fewer steps than `steps`, and saves none of them.
+        # With `SaveAt(steps=k)`, a run of fewer than k steps saves no rows.
         pieces.append(jax.tree.map(lambda x: np.asarray(x)[:0], last.saved))
     if saveat.ts is not None:
         if steps is None:
@@ -501,7 +501,7 @@ def run_in_chunks(
     if saveat.saves_end(output.num_steps):
         pieces.append(_one(on_host(last.saved_end)))
     if not pieces and saveat.saves_rows:
-        # A run whose steps differ may have fewer steps than the stride of its output.
+        # A run with variable steps may have fewer steps than the stride of its output.
         pieces.append(jax.tree.map(lambda x: x[:0], _one(on_host(start.saved))))
     ts, ys = on_device(joined(pieces), last.end.t) if pieces else (None, None)
     interpolation, result = None, last.carry.result
@@ -722,7 +722,7 @@ def _interpolation(
 ) -> DenseInterpolation:
     """Return the dense output, from the records of all steps.
 
-    `number` is the number of steps of a run whose steps differ.
+    `number` is the number of steps of a run with variable steps.
     """
     return DenseInterpolation(
         system=stepper.system,

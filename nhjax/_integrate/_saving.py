@@ -25,7 +25,7 @@ def save_state(t: FloatScalar, y: State, args: Any) -> State:
 
 
 class SaveAt(eqx.Module):
-    """The output of `integrate`: which states of a trajectory it saves.
+    """Options for the output of `integrate`: which states of a run are saved.
 
     The options have the same meanings as the options of `diffrax.SaveAt`.
 
@@ -36,7 +36,7 @@ class SaveAt(eqx.Module):
     - `ts`: save at these times, by evaluating the collocation polynomials. The times
         must be sorted in the direction of time.
     - `steps`: save after every step (True), or after every k-th step (an int k). With
-        `t1=True` the final state is saved too, but not twice.
+        `t1=True` the final state is saved too, unless it is one of these states.
     - `dense`: save the collocation polynomials for `Solution.evaluate`.
     - `fn`: save `fn(t, y, args)` instead of y.
     - `checkpoint`: save a `Solution.checkpoint`, from which a later run continues bit
@@ -46,9 +46,9 @@ class SaveAt(eqx.Module):
     exceptions in runs with events or with steps that differ in size. With constant
     steps, saving every k-th step (`steps=k`) and saving at given times (`ts`) need no
     buffer of the length of the run. The samples at `ts` are computed after the run,
-    from the records of the steps that contain them. Between the ends of steps, the
-    polynomials have larger errors than the states at the ends, and the constraints hold
-    only up to these larger errors, not to round-off.
+    from the records of the steps that contain them. Inside a step, the polynomials have
+    larger errors than the states at its ends, and the constraints hold up to these
+    errors, not to round-off.
 
     **Raises:** `ValueError` if no output is selected, a flag is not a bool, `steps` is
     not a bool or an int >= 1, `ts` is not a sorted vector, or `ts` and `steps` are
@@ -259,9 +259,8 @@ def record_places(
     length = static_length(num_steps)
     if dense or sampled is None:
         return RecordPlaces(length, jnp.arange(length + 1, dtype=jnp.int32))
-    # There is one row for each sample, and samples in the same step share the row of
-    # the first sample. There may be more steps than samples, or more samples than
-    # steps.
+    # The buffer has one row for each sample, but samples in the same step use only the
+    # row of the first of them. There may be more or fewer steps than samples.
     number = sampled.shape[0]
     slots = jnp.full((length + 1,), number, jnp.int32)
     first = slots.at[sampled].min(jnp.arange(number, dtype=jnp.int32))
@@ -272,7 +271,7 @@ class Saving(eqx.Module):
     """The data that the iterations of a run save, and their places in the buffers.
 
     A run saves the value of `fn` at the state after every `stride`-th step (after none
-    if `stride` is 0). These are `num_saved` entries. The run keeps `num_records`
+    if `stride` is 0), which gives `num_saved` entries. The run keeps `num_records`
     records of steps, and `log_length` entries of the stepper's log. `num_steps` is used
     only if steps save rows or records.
 

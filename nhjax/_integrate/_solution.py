@@ -55,9 +55,9 @@ class Solution(eqx.Module):
     - `stats`: a dictionary of numbers about the run:
         `num_steps` (the number of completed steps),
         `num_iterations` (the total number of iterations of the stage solver),
-        `num_newton_steps` (the number of steps for which the stage solver's own
-        iteration failed, and which Newton's method solved),
-        `num_rejected_steps` (only in a run whose steps differ: the number of attempts
+        `num_newton_steps` (the number of steps that Newton's method solved after the
+        stage solver's own iteration had failed),
+        `num_rejected_steps` (only in a run with variable steps: the number of attempts
         at a step that were repeated with another size),
         `num_unsolved_steps` (also only in such a run: the number of these attempts
         whose equations were not solved),
@@ -92,9 +92,9 @@ class Solution(eqx.Module):
         this event, and with constant steps all later entries of `ts` and `ys` repeat
         the time and the state of the event.
 
-    If the steps differ in size, the output of a call outside of transformations has
-    exactly the steps that were taken. Under `jit` the output has entries for the
-    largest possible number of steps, and entries that are not used are infinite.
+    With variable steps, the output of a call outside of transformations has exactly the
+    steps that were taken. Under `jit` the output has entries for the largest possible
+    number of steps, and entries that are not used are infinite.
 
     Under `vmap` every array has a leading axis for the members of the batch.
     """

@@ -58,8 +58,8 @@ class Attempt(NamedTuple):
     - `chosen`: the size that the controller chose. The size h is smaller if the run
         ends in the step, and for the parts of a step before and after an event.
     - `is_solved`: whether the equations of the step were solved.
-    - `is_whole`: whether the step ends where a step of the size `chosen` would end, and
-        not earlier at the end of the run.
+    - `is_whole`: whether the step ends where a step of the size `chosen` would end.
+        Otherwise it ends earlier, at the end of the run.
     - `node`: the number of steps before this step.
     """
 
@@ -92,11 +92,11 @@ class Decision(NamedTuple):
 
 
 class AbstractStepSizeController(eqx.Module):
-    """The way in which a run chooses its steps, the option `stepsize_controller`."""
+    """The way in which a run chooses its step sizes: option `stepsize_controller`."""
 
     @property
     def estimates_errors(self) -> bool:
-        """Return whether its decisions have an estimated `error`."""
+        """Return whether the decisions of the controller have an estimated `error`."""
         return False
 
     def checks(self) -> list[Check]:
@@ -107,7 +107,7 @@ class AbstractStepSizeController(eqx.Module):
     def init(
         self, context: StepContext, t: FloatScalar, start: StepState
     ) -> tuple[FloatScalar, Memory, RESULTS]:
-        """Return the size of the first step, the first memory, and a result.
+        """Return the size of the first step, the initial memory, and a result.
 
         The result is `RESULTS.successful`, or the reason why the run fails.
         """
@@ -138,7 +138,7 @@ class AbstractStepSizeController(eqx.Module):
     def given_size(
         self, context: StepContext, node: Int[Array, ""]
     ) -> FloatScalar | None:
-        """Return the size of a step if it is given by the user; otherwise None."""
+        """Return the size of a step if the user gave it; otherwise None."""
         del context, node
         return None
 
@@ -162,7 +162,7 @@ class AbstractStepSizeController(eqx.Module):
 
 
 def _decided(attempt: Attempt, size: FloatScalar, memory: Memory) -> Decision:
-    """Accept a step that is solved; otherwise the run fails."""
+    """Accept a solved step; the run fails if the step is not solved."""
     result = RESULTS.where(
         attempt.is_solved, RESULTS.successful, attempt.outcome.result
     )
@@ -214,7 +214,7 @@ def _size_of_user(context: StepContext) -> FloatScalar:
 
 
 class GivenStepSizes(AbstractStepSizeController):
-    """Steps of given sizes, for an array `dt` of `nhjax.integrate`."""
+    """Steps of the sizes in an array `dt` of `nhjax.integrate`."""
 
     sizes: Float[Array, " num_steps"]
 
@@ -255,8 +255,8 @@ class PIDController(AbstractStepSizeController):
 
         h_{n+1} = h_n safety e_n^{-β1} e_{n-1}^{-β2} e_{n-2}^{-β3}
 
-    within the limits of `factormin` and `factormax`, where with the order p of the
-    method and k = p + 1
+    within the limits of `factormin` and `factormax`. The exponents, with the order p of
+    the method and k = p + 1, are
 
         β1 = (pcoeff + icoeff + dcoeff) / k,  β2 = -(pcoeff + 2 dcoeff) / k,
         β3 = dcoeff / k
@@ -381,7 +381,7 @@ class PIDController(AbstractStepSizeController):
     def init(
         self, context: StepContext, t: FloatScalar, start: StepState
     ) -> tuple[FloatScalar, Memory, RESULTS]:
-        """Return `dt`, or without it a size that changes the state by one percent."""
+        """Return `dt` or, if None, a size that changes the state by one percent."""
         # Before the first step there are no earlier errors and growth rates. The errors
         # are taken as one, and the growth rates as infinite, which means unknown.
         one = jnp.ones((), t.dtype)
@@ -455,7 +455,7 @@ class PIDController(AbstractStepSizeController):
         )
         error, found, size = jax.lax.stop_gradient((error, found, jnp.abs(h)))
         # The growth rate of a single step may be small by chance. The stored growth
-        # rate therefore falls by at most a half in each step.
+        # rate therefore falls by at most half in each step.
         is_first = jnp.isinf(growth_rates)
         growth_rates = jnp.where(
             is_first, found, jnp.maximum(found, 0.5 * growth_rates)
@@ -526,8 +526,8 @@ class ReversibleController(AbstractStepSizeController):
 
     where G = d/dt log Q along the motion and ρ_0 = Q(y_0) (Hairer and Söderlind,
     Explicit, time reversible, adaptive step size control, 2005). The density follows Q
-    up to O(ε²). A run backward in time from the checkpoint of a run takes the same
-    steps back. In a reversible system with a symmetric method, energies that do not
+    up to O(ε²). A run backward in time from a checkpoint retraces the steps of the run
+    that saved it. In a reversible system with a symmetric method, energies that do not
     drift with constant steps do not drift with these steps either. No step is rejected.
     After an event has reset the state, the density starts again from Q of the new
     state.
@@ -544,7 +544,7 @@ class ReversibleController(AbstractStepSizeController):
         step.
 
     **Raises:** `ValueError` if `eps` is not positive. `integrate` raises a `ShapeError`
-    if the density has another shape than (), and an `IntegrationError` where it is not
+    if the density does not have the shape (), and an `IntegrationError` if it is not
     positive.
 
     !!! example
@@ -682,7 +682,7 @@ class ReversibleController(AbstractStepSizeController):
         end = attempt.t + attempt.h
         _, following = self._density(context, end, attempt.outcome.step_state)
         eps = jnp.asarray(self.eps, density.dtype) * context.direction
-        # A shorter step counts as a step with a smaller ε, the solution of the equation
+        # A shorter step of size h counts as a step with the smaller ε that solves
         # h = ε / (ρ + ε G / 2).
         h = jax.lax.stop_gradient(attempt.h)
         part = jnp.where(attempt.is_whole, eps, h * density / (1 - 0.5 * h * rate))
@@ -768,7 +768,7 @@ def fastest_frequency(
     by_position, by_fibre = jax.jacfwd(acceleration, argnums=(0, 1))(
         jnp.zeros_like(u), u
     )
-    # The metric is M for a Lagrangian system, and M⁻¹ for a Hamiltonian system, where
+    # For a Lagrangian system the metric is M. For a Hamiltonian system it is M⁻¹, and
     # the derivative of dp/dt with respect to q is a bilinear form, not a linear map.
     metric = system.metric(t, q, u, args)
     inverse_metric = inverse(metric)

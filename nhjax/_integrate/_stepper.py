@@ -61,11 +61,11 @@ class StepResult(NamedTuple):
     - `t`: the time that the iteration reached.
     - `record`: the record of the step, for interpolation.
     - `is_good`: whether a step was taken and solved.
-    - `row`: the index of the output row that the iteration fills, equal to the number
-        of steps if it fills none. It is None if iteration k always fills row k.
-    - `log_entry`, `log_slot`: an entry for the log of the stepper and its index there,
-        equal to the length of the log if there is no entry. They are None for a stepper
-        without a log.
+    - `row`: the index of the output row that the iteration fills; the number of steps
+        if it fills no row; None if iteration k always fills row k.
+    - `log_entry`, `log_slot`: an entry for the log of the stepper, and its index in the
+        log. Without an entry the index is the length of the log. Both are None for a
+        stepper without a log.
     """
 
     t: FloatScalar
@@ -107,11 +107,11 @@ class AbstractStepper(eqx.Module, Generic[C, R]):
     @property
     @abstractmethod
     def num_iterations(self) -> int | IntScalar:
-        """Return the number of iterations within which the run is certain to end."""
+        """Return an upper bound on the number of iterations of the run."""
 
     @property
     def may_end_early(self) -> bool:
-        """Return whether the loop stops where `is_over` is true for the carry."""
+        """Return whether the loop stops as soon as `is_over` is true for the carry."""
         return False
 
     def is_over(self, carry: C) -> BoolScalar:
@@ -121,7 +121,7 @@ class AbstractStepper(eqx.Module, Generic[C, R]):
     def progress(self, carry: C) -> Any:
         """Compute the part of the run that is done, from 0 to 1.
 
-        The result is None unless the run may end early.
+        The result is None if the run cannot end early.
         """
         del carry
         return None
@@ -219,7 +219,7 @@ class AbstractReverseReplay(eqx.Module, Generic[C, R]):
 
 
 class PlainCarry(AbstractCarry):
-    """The carry of a run without events. Derivatives pass through the state alone."""
+    """The carry of a run without events. Derivatives pass only through the state."""
 
     step_state: StepState
     result: RESULTS
@@ -229,12 +229,12 @@ class PlainCarry(AbstractCarry):
 class PlainStepper(AbstractStepper[PlainCarry, None]):
     """One step of the method per iteration, from node to node.
 
-    - `args`: the same in all steps; the loop, the output and the events read them here.
+    - `args`: the `args` of the run; the loop, the output and the events read it here.
     - `programs`: the traced program of a step, shared by all derivatives of the run.
     - `origin`: where times and steps are counted from. The first step of the run has
         the number `origin.first_step`.
     - `noise`: the round-off of the functions of the system, measured at the start of
-        the run, or at the start of the first run if this run resumes a checkpoint.
+        the run. If the run resumes a checkpoint, it is the value of the first run.
     """
 
     system: AbstractMechanicalSystem
@@ -347,7 +347,7 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
         good = alive & (outcome.result == RESULTS.successful)
         step_state = tree_where(good, outcome.step_state, carry.step_state)
         # JAX differentiates the body of a loop repeatedly, until it knows which parts
-        # of the carry have derivatives. With the next line it knows in the first pass.
+        # of the carry have derivatives. With the next line, the first pass is enough.
         step_state = step_state.differentiated_in_state()
         result = RESULTS.where(alive, outcome.result, carry.result)
         stats = updated_statistics(carry.stats, outcome, alive, good, i)
@@ -454,7 +454,7 @@ class StepInterval(NamedTuple):
 def step_back(
     stepper: PlainStepper, step_state: StepState, interval: StepInterval
 ) -> StepState:
-    """Compute the state that a step started from, given the state that it led to."""
+    """Compute the state at the start of a step from the state at its end."""
     run = jnp.asarray(False)
 
     def back_from(step_state: StepState) -> StepState:
@@ -465,7 +465,7 @@ def step_back(
         return back_from(step_state)
 
     # The unknown is the state z from which a step back starts. Each iteration takes
-    # this step from z to a state y, takes a step forward from y, and moves z by the
+    # this step from z to a state y, and then a step forward from y. It moves z by the
     # difference between `step_state` and the end of the forward step. The two steps
     # undo each other up to a small error, so this iteration converges far faster than
     # an iteration with the unknown y.
@@ -517,9 +517,9 @@ def is_consistent(
 
     A consistent state lies on the group and satisfies the constraints, and the Legendre
     transform maps its v to its p. `violations` are the constraint violations that count
-    as round-off. The bound on the errors detects a state of another system, and a state
-    in which only one part was changed. It is large enough for the perturbations of
-    finite differences.
+    as round-off. The bound on the errors is small enough to detect a state of another
+    system, or a state of which only one part was changed. It is large enough for the
+    perturbations of finite differences.
     """
     y, lin = start.state, start.lin
     small = float(jnp.finfo(y.p.dtype).eps) ** 0.25

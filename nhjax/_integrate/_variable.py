@@ -60,7 +60,7 @@ class Clock(eqx.Module):
 class NextStep(NamedTuple):
     """The next step of a run, from the time t with the size h.
 
-    - `is_whole`: whether the step ends where the chosen size leads.
+    - `is_whole`: whether the step ends where a step of the chosen size would end.
     - `is_last`: whether the step instead ends at the given end `t1` of the run.
     """
 
@@ -143,7 +143,7 @@ class StepSizes(eqx.Module):
     ) -> Clock:
         """Return the clock after an attempt.
 
-        `end` is the time after the step with its rounding error, and `num_steps` the
+        `end` is the time after the step with its rounding error, and `num_steps` is the
         number of completed steps.
         """
         t, compensation = end
@@ -170,7 +170,7 @@ class StepSizes(eqx.Module):
 
 
 class VariableCarry(AbstractCarry):
-    """The carry of a run with steps of different sizes.
+    """The carry of a run with variable steps.
 
     Derivatives pass through the state and the time.
     """
@@ -382,7 +382,7 @@ def statistics_of_attempt(
     rejected: BoolScalar,
     accepted: BoolScalar,
 ) -> Statistics:
-    """Return the statistics that only runs with a controller have, after an attempt."""
+    """Update, after an attempt, the statistics that only variable steps have."""
     more: Statistics = {}
     counted = {
         "num_rejected_steps": rejected,

@@ -114,8 +114,8 @@ class AbstractLieGroup(eqx.Module):
         """Return `q` with its angles reduced to one turn.
 
         The functions of a system are called with this element. An angle that has grown
-        over many turns is replaced by the equivalent angle of the first turn, plus the
-        compensation: the smaller number has a smaller rounding error.
+        over many turns is replaced by the equivalent angle of the first turn plus the
+        compensation, because a smaller number has a smaller rounding error.
         """
         return q
 
@@ -133,7 +133,7 @@ class AbstractLieGroup(eqx.Module):
     def advance_across(
         self, q: Element, xi: Vector, compensation: Element
     ) -> tuple[Element, Element]:
-        """Compute g τ(-ξ)⁻¹ τ(ξ), from -ξ to ξ in the chart, as `advance` does."""
+        """Advance from -ξ to ξ in the chart, to g τ(-ξ)⁻¹ τ(ξ), as `advance` does."""
         return self.advance(self.act_back(q, -xi), xi, compensation)
 
     def tangent(self, g: Element, eta: Vector) -> Element:

@@ -165,7 +165,7 @@ class SE2(AbstractMotionGroup):
 
     The body velocity is (v1, v2, ω), with d(x, y)/dt = R(θ) (v1, v2) and dθ/dt = ω. As
     on `SO2`, the angle is never wrapped to one turn, and the functions of a system must
-    have the period 2π in it.
+    be 2π-periodic in the angle.
 
     **Arguments:**
 
@@ -311,9 +311,9 @@ class SE2(AbstractMotionGroup):
 class FramedPose(eqx.Module):
     """A pose (x, y, θ) together with cos θ and sin θ, the frame of the body.
 
-    It replaces a pose inside a step to save trigonometric functions. The retraction
-    gives the cosine and sine of the angle between two poses, so that the frame of the
-    second pose follows from the frame of the first one by products.
+    It replaces a pose inside a step to avoid trigonometric functions. The retraction
+    gives the cosine and sine of the angle between two poses. From these, products give
+    the frame of the second pose from the frame of the first pose.
     """
 
     pose: Float[Array, "3"]

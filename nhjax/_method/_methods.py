@@ -170,11 +170,12 @@ class AbstractMethod(eqx.Module):
         """Return the order of convergence of the multiplier that a solution reports.
 
         With `closure="propagated"` this order is the smaller of q in C(q) and Q in
-        CĈ(Q), minus one if R_A(∞) = 1, then rounded up to an even number if the method
-        is symmetric, and at most `constrained_order`. Runs of many tableaux show this
-        rule. (The paper's theorem on global convergence has q in place of the smaller
-        of q and Q, which is the same for Lobatto's nodes.) With the other closures the
-        multiplier is the continuous multiplier, which has the order of the state.
+        CĈ(Q). One is subtracted if R_A(∞) = 1. The result is then rounded up to an even
+        number if the method is symmetric, and limited to `constrained_order`. Runs of
+        many tableaux confirm this rule. (The paper's theorem on global convergence has
+        q in place of the smaller of q and Q, which is the same for Lobatto's nodes.)
+        With the other closures the multiplier is the continuous multiplier, which has
+        the order of the state.
 
         **Raises:** `ValueError`, as `require_constraint_hypotheses` does.
         """
@@ -351,10 +352,10 @@ class LobattoIIIAB(AbstractMethod):
         """Return the method whose number of stages suits a tolerance.
 
         With more stages, steps can be larger, which saves time if errors must be small.
-        With these numbers of stages, the error at the end of a run was most often
-        within a factor of ten of `rtol`. With one or two stages more, runs take less
-        time for an error of the same size, but the error at the end is often far
-        smaller than `rtol`. Both were measured by `benchmarks.adaptive_steps`.
+        With the returned number of stages, the error at the end of a run was most often
+        within a factor of ten of `rtol`. With one or two stages more, runs to the same
+        error take less time, but the error is often far smaller than `rtol`.
+        `benchmarks.adaptive_steps` measured both facts.
 
         **Arguments:**
 

@@ -113,7 +113,7 @@ def _nonholonomic(
 ) -> list[Any]:
     """Return the velocity constraints that are not rates of holonomic constraints.
 
-    Kane's method needs the rates of configuration constraints among its velocity
+    The velocity constraints of a `KanesMethod` include the rates of its configuration
     constraints. All velocity constraints are linear in the speeds.
     """
     if not method._f_nh:

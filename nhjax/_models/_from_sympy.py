@@ -136,24 +136,25 @@ def from_sympy(
 
     - `lagrangian`: L, an expression in the coordinates, their time derivatives and
         `dynamicsymbols._t`. It may also be a `LagrangesMethod`, which defines all other
-        arguments except `parameters`, or a `KanesMethod` with bodies: its kinematical
-        differential equations replace speeds by rates of coordinates, its loads become
-        forces, and its configuration and velocity constraints become constraints.
+        arguments except `parameters`, or a `KanesMethod` with bodies. The kinematical
+        differential equations of a `KanesMethod` replace speeds by rates of
+        coordinates, its loads become forces, and its configuration and velocity
+        constraints become constraints.
     - `coordinates`: the functions q(t), a list of `dynamicsymbols`, in the order of q.
     - `nonholonomic`: expressions in q, q' and t that must be zero, or equations. They
         need not be linear in q'.
     - `holonomic`: expressions in q and t that must be zero, or equations.
     - `forces`: generalised forces, as a list with one for each coordinate, or as a
-        dictionary by coordinates or their names. It may also be a list of pairs of a
-        point and a force, or a frame and a torque, as for `LagrangesMethod`, together
-        with `frame`.
+        dictionary by coordinates or their names. It may also be a list of pairs:
+        (point, force) or (frame, torque), as for `LagrangesMethod`; `frame` is then
+        required.
     - `parameters`: values of the remaining symbols, by symbol or name. Symbols without
         a value must be in `args` at run time.
     - `frame`: the inertial frame for forces at points and torques on frames.
     - `potential`: the potential energy of a `KanesMethod`. The default is the sum of
-        the potential energies of its bodies. It is required if bodies have a potential
-        energy and there are loads; pass 0 if the loads include the forces of this
-        energy.
+        the potential energies of its bodies. The argument is required if bodies have a
+        potential energy and there are loads: pass 0 if the loads include the forces of
+        this energy.
 
     **Returns:** a `SymPyModel` with the `system`, the `args` for `integrate`, and the
     names of the coordinates, which `Solution.to_xarray` uses.

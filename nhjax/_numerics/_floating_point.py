@@ -19,8 +19,7 @@ def max_norm(*arrays: Array) -> FloatScalar:
     The maximum is taken over the bit patterns, which have the same order as the
     nonnegative numbers, with NaN above infinity. A maximum of floats that propagates
     NaN takes five dependent instructions, and a maximum of integers takes two. With
-    maxima of floats, these norms took a third of the time of an iteration on the
-    stages.
+    maxima of floats, these norms took a third of the time of a stage iteration.
     """
     dtype = jnp.result_type(*arrays)
     largest = [jnp.max(_pattern(x.astype(dtype)), initial=0) for x in arrays]
@@ -36,9 +35,9 @@ def largest_column(*arrays: Float[Array, "_ n"]) -> tuple[FloatScalar, Int[Array
     """Compute max |x| over matrices of n columns, and the column that contains it.
 
     The last bits of each bit pattern are replaced by the index of its column, so that
-    one maximum finds the value and the column; the value loses these bits. A search for
-    the column after the maximum took a tenth of the time of a step. If some numbers are
-    NaN, the result is a column that contains NaN.
+    one maximum finds the value and the column; the value loses these bits. A separate
+    search for the column took a tenth of the time of a step. If some numbers are NaN,
+    the result is a column that contains NaN.
     """
     columns = arrays[0].shape[1]
     mask = (1 << max(columns - 1, 0).bit_length()) - 1
@@ -81,12 +80,12 @@ def two_sum(
 
 
 def uneven_perturbations(q: PyTree[Array]) -> PyTree[Array]:
-    """Return a perturbation of each number in q, of half the number's size or more.
+    """Return a perturbation of each number in q, of half to all of the number's size.
 
-    No perturbation is larger than its number. The perturbations differ and have both
-    signs, so that they hardly cancel in differences and sums of a few numbers. Relative
-    perturbations are ±(1 - x/2). The x are the fractional parts of multiples of the
-    golden ratio, which are spread evenly over [0, 1).
+    The perturbations differ and have both signs, so that they hardly cancel in
+    differences and sums of a few numbers. Relative perturbations are ±(1 - x/2). The x
+    are the fractional parts of multiples of the golden ratio, which are spread evenly
+    over [0, 1).
     """
     numbers, unravel = ravel_pytree(q)
     k = np.arange(numbers.size)
@@ -122,10 +121,10 @@ def measured_noise(
     Values at points that are close to each other differ by a smooth change and by
     round-off. A difference of fifth order removes the smooth change and leaves the
     round-off (Moré and Wild, Estimating computational noise, SIAM J. Sci. Comput. 33,
-    2011). Such a measurement includes the effects of constants in the function and of
-    cancellation, and the round-off of arguments, which steep functions magnify.
+    2011). The result includes the effects of cancellation, of constants in the
+    function, and of the round-off of arguments, which steep functions magnify.
 
-    Very small displacements may be lost in a sum with a constant in the function, and
+    Very small displacements are lost if the function adds a large constant to them, and
     values at larger displacements may differ by more than round-off. Therefore the
     function is measured at four distances (5e-14 to 1e-8 in double precision). The
     search stops at the first distance at which the fifth difference is much smaller
@@ -186,6 +185,6 @@ def measured_noise(
 
 
 def _weights(order: int) -> np.ndarray:
-    """Return the weights of a difference, scaled to preserve the deviation of noise."""
+    """Return the weights of a difference, scaled so that their squares sum to 1."""
     weights = np.array([(-1.0) ** k * math.comb(order, k) for k in range(order + 1)])
     return weights / np.linalg.norm(weights)

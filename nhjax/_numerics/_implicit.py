@@ -67,7 +67,7 @@ class AbstractImplicitFunction(eqx.Module, Generic[Arguments, Solution]):
         """Compute the tangent of the solution for arguments that change at `rates`.
 
         Where a leaf of `rates` is None, the argument does not change. Leaves of the
-        result may be None, which stands for zero too.
+        result may also be None, which stands for zero.
         """
 
     def __call__(self, arguments: Arguments) -> Solution:
@@ -138,7 +138,7 @@ def solve_contraction(
     ρ, the sum of the remaining terms is at most ρ / (1 - ρ) times this bound.
 
     If x -> G x + b is a linearised simplified Newton iteration, the sum is iterative
-    refinement with the factors of that iteration. The sum takes about as many
+    refinement with the matrix factors of that iteration. It takes about as many
     evaluations as the nonlinear iteration took. Derivatives of every order follow from
     the equation, not from the iterations.
 
@@ -201,7 +201,7 @@ def _minus(xs: list[Array], ys: list[Array]) -> list[Array]:
 
 
 def _depending_on_all(xs: list[Array]) -> list[Array]:
-    """Return the same arrays, changed so that each array depends on all arrays.
+    """Return arrays with the same values, each of which depends on all the arrays.
 
     Differentiation then treats either all or none of the arrays as constants. JAX
     cannot transpose a linear equation if only a part of its right-hand side is treated
@@ -262,7 +262,7 @@ def root(
             def residual(z):
                 return ravel_pytree(path(part, unravel(z)))[0], None
 
-            # Increments are shortened, because whole increments may cycle at a kink.
+            # Increments are shortened, because full increments may cycle at a kink.
             dx, _ = dense_increment(residual, x, solve)
             shorter = x[None] + jnp.outer(0.5 ** jnp.arange(5, dtype=x.dtype), dx)
             sizes = jax.vmap(lambda z: max_norm(residual(z)[0]))(shorter)
@@ -368,8 +368,8 @@ def _with_zero_tangents_jvp(primals, tangents):
     given = jax.tree.leaves((rates, others))
     if not given:
         return leaves, rates
-    # This zero is a sum over no entries of a tangent. JAX interprets zeros that depend
-    # on no tangent as the absence of a tangent.
+    # This zero is the sum of an empty slice of a tangent, so that it depends on the
+    # tangent. JAX treats a zero that depends on no tangent as a missing tangent.
     zero = jnp.sum(jnp.ravel(given[0])[:0])
     return leaves, [
         jnp.zeros_like(x) + zero.astype(x.dtype) if rate is None else rate
@@ -443,9 +443,8 @@ def _value_jvp(primals, tangents):
 def nan_tangent_unless(ok: BoolScalar, dx: Array) -> Array:
     """Return a tangent, but NaN where `ok` is false and the tangent is not zero.
 
-    This function is not linear, but JAX can only transpose linear functions. Therefore
-    it is written as a linear solve. The transpose of this solve does the same to a
-    cotangent.
+    This function is not linear, but JAX can transpose only linear functions. Therefore
+    it is written as a linear solve, whose transpose does the same to a cotangent.
     """
 
     def solve(_, b):

@@ -24,7 +24,7 @@ NOISE_UNITS = 400
 # treated as noise. Each further failure multiplies this level by one of the two factors
 # below, and each new smallest increment divides the level by the same factor. The
 # factor is smaller for iterations that may be slow, since their increments may rise and
-# fall before they have converged.
+# fall before convergence.
 _FIRST_UNITS = 30.0
 _GROWTH, _GROWTH_IF_SLOW = 30.0, 2.0
 # An iteration counts as divergent if an increment is larger than this factor times the
@@ -35,8 +35,8 @@ _LARGEST_NOISE = 1e5
 # After more than this many iterations, an iteration counts as slow.
 _SLOW = 100
 # The last increment of a slow iteration is treated as noise up to this many times the
-# measured noise. Near positions at which constraints become dependent, increments
-# were seen that vary between 5 and 19 times the noise and do not fall further.
+# measured noise. Near positions at which constraints become dependent, increments have
+# been seen to vary between 5 and 19 times the noise without falling further.
 _LAST_UNITS = 32.0
 
 
@@ -114,16 +114,16 @@ def iterate(
     """Repeat `iteration` until its increments no longer fall.
 
     `iteration(x)` returns the next iterate, the sizes of the increment and of the
-    iterate, and auxiliary values at x. Increments are measured relative to `scale`, the
-    size of x, or relative to the size of the iterate if that is larger, because x may
-    start from zero. If both sizes are zero, increments are measured relative to the
-    first increment. The round-off of x is proportional to the same size or, if data are
-    larger than x, to `scale` plus `round_off`. `noise` is a measured size: increments
-    always contain errors of about the unit round-off times `noise`.
+    iterate, and auxiliary values at x. Increments are measured relative to the size of
+    x: `scale`, or the size of the iterate if that is larger, because x may start from
+    zero. If both are zero, increments are measured relative to the first increment. If
+    data are larger than x, they add to its round-off: `scale` plus `round_off` then
+    replaces `scale`. `noise` is a measured size: increments always contain errors of
+    about the unit round-off times `noise`.
 
     The iteration ends
 
-    - when an increment is below the round-off of these sizes or `tolerance`;
+    - when an increment is below `tolerance` or the round-off of these sizes;
     - when small increments have stopped falling, because they are then round-off;
     - when an increment is not finite, or far larger than the first increment and the
         iterate;
@@ -186,7 +186,7 @@ def _progress(rules: _Rules, before: _Progress, sizes: UpdateNorms) -> _Progress
     """Update the progress of an iteration by an increment; decide whether it ends."""
     increment = sizes.increment
     first = jnp.where(before.iterations == 0, increment, before.first)
-    # The norms are compared without divisions, because their latencies would add up.
+    # The norms are compared without divisions, whose latencies would add up.
     found = jnp.maximum(rules.scale + rules.round_off, sizes.iterate)
     has_size = found > 0
     measure = jnp.where(has_size, found, before.first)
@@ -217,7 +217,7 @@ def _progress(rules: _Rules, before: _Progress, sizes: UpdateNorms) -> _Progress
     converged = small | stagnant
     is_last = count >= rules.max_iterations
     if rules.max_iterations > _SLOW:
-        # Where the noise is nearly as large as x, it says nothing about convergence.
+        # Noise that is nearly as large as x says nothing about convergence.
         eps = float(jnp.finfo(increment.dtype).eps)
         limit = _LAST_UNITS * jnp.minimum(rules.noise, _LARGEST_NOISE * eps * measure)
         converged = converged | (is_last & (increment <= limit))

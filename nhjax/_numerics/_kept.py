@@ -1,8 +1,8 @@
 """Functions of a user that are traced and differentiated once.
 
-A run needs the Lagrangian of a system and its derivatives at more than ten places, and
-JAX traces and differentiates a function again at each place. This would take most of
-the time of a first call. Here a function becomes one operation, `kept_call`, whose
+A run needs the Lagrangian of a system and its derivatives at more than ten places. JAX
+would trace and differentiate the Lagrangian again at each place, which would take most
+of the time of a first call. Here a function becomes one operation, `kept_call`, whose
 program is traced once. The programs of its derivatives are stored together with this
 program, and later runs reuse all of them.
 """
@@ -77,8 +77,8 @@ def kept_function(
 
     If the same function is traced again for the same kinds of arguments, and the values
     that it reads have not changed, its programs are reused. The result is None if the
-    function must not become one operation, because it has effects, such as printing, or
-    because its arguments or constants are sharded over devices.
+    function must not become one operation: if it has effects, such as printing, or if
+    its arguments or constants are sharded over devices.
 
     **Arguments:**
 
@@ -234,7 +234,7 @@ for _lower, _platform in ((_inlined, None), (_in_kernel, "cpu")):
 
 
 def _jvp(primals, tangents, *, jaxpr: Any, kept: _Program):
-    """Compute the values and their tangents by two operations, the second linear."""
+    """Compute values by one operation and their tangents by another, linear one."""
     out = kept.bind(*primals)
     moving = tuple(not isinstance(x, ad.Zero) for x in tangents)
     rates = [x for x in tangents if not isinstance(x, ad.Zero)]

@@ -304,10 +304,10 @@ class WeightedTranspose(AbstractOperator):
 class BlockTridiagonalInverse(AbstractOperator):
     """The inverse of a block tridiagonal matrix, stored as factors of an elimination.
 
-    There are q unknowns and q residuals for each of the l rows of the pattern. They are
-    arrays of shape (q, l), or vectors of length q l. Blocks are eliminated from the
-    first to the last. With the diagonal, lower and upper blocks D_k, L_k and U_k of
-    row k, and
+    There are q unknowns and q residuals for each of the l rows of the pattern. Unknowns
+    and residuals are arrays of shape (q, l), or vectors of length q l. Blocks are
+    eliminated from the first to the last. With the diagonal, lower and upper blocks
+    D_k, L_k and U_k of row k, and
 
     P_k = D_k - L_k P_{k-1}⁻¹ U_{k-1},
 
@@ -362,7 +362,7 @@ class BlockTridiagonalInverse(AbstractOperator):
     ) -> BoolScalar:
         """Return whether left @ right, whose inverse is `self`, is singular.
 
-        The product counts as singular if a pivot is round-off compared with the
+        The product counts as singular if a pivot is as small as the round-off of the
         diagonal entries of its rows. The two factors are B and diag(w) Bᵀ.
         """
         assert isinstance(left, SparseMatrix)
@@ -459,9 +459,8 @@ def jacobian_by_rows(
 
 
 def _unit_vectors(u: Float[Array, " n"]) -> Float[Array, "n n"]:
-    # For `nhjax.lanes`, the product of any number with a zero that pads an array is
-    # zero. A product with a zero of `jnp.eye` must be computed, because the other
-    # factor may be infinite.
+    # `nhjax.lanes` omits products with zeros that pad an array. It must compute
+    # products with the zeros of `jnp.eye`, because the other factor may be infinite.
     n, one, zero = u.shape[0], jnp.ones((1,), u.dtype), jnp.zeros((), u.dtype)
     rows = [jax.lax.pad(one, zero, [(k, n - 1 - k, 0)]) for k in range(n)]
     return jnp.stack(rows)

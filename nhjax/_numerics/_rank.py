@@ -27,7 +27,7 @@ class RankCondition(NamedTuple):
 
     For k constraints Γ on positions and m constraints Φ on velocities, the `jacobian`
     has the k rows of DΓ, or the m + k rows of D2Φ and DΓ. Its rank matters only if
-    `is_active` is true. The rank at the starting values of Newton's method is active
+    `is_active` is true. A condition at the starting values of Newton's method is active
     only if the method fails; otherwise the method has moved to another configuration.
     """
 
@@ -173,8 +173,8 @@ def least_norm_inverse_by_blocks(
     """Compute a generalised inverse of C; the last equations have priority.
 
     The equations have two parts, and `first` is the number of equations in the first
-    part. As far as equations of the first part follow from the second part, their
-    unknowns are zero. Apart from this, each of the two parts of x has the least norm of
+    part. If an equation of the first part follows from the second part, its unknown is
+    zero. Otherwise, each of the two parts of x has the least norm, as in
     `least_norm_inverse`. If no equation of one part follows from the other part, the
     result is equal to the result of `least_norm_inverse`.
     """
@@ -182,8 +182,8 @@ def least_norm_inverse_by_blocks(
         return least_norm_inverse(matrix)
     others = least_norm_inverse(matrix[first:, first:])
     onto = matrix[:first, first:] @ others
-    # If an equation of the first part follows from the second part, its part of the
-    # Schur complement is round-off. The additional block of size one makes `pinv`
+    # If an equation of the first part follows from the second part, its entries of the
+    # Schur complement are round-off. The additional block of size one makes `pinv`
     # compare this round-off with one, the size of the scaled diagonal before the
     # elimination.
     left = matrix[:first, :first] - onto @ matrix[first:, :first]

@@ -24,8 +24,8 @@ _REARRANGING = """
     broadcast_in_dim concatenate copy copy_p expand_dims gather pad reshape rev slice
     split squeeze transpose
 """.split()  # noqa: SIM905
-# Integers and booleans may be indices. They are computed if an array has at most this
-# many elements.
+# Integers and booleans may be indices. Their values are computed if the array has at
+# most this many elements.
 _LONGEST_INDEX = 10_000
 
 
@@ -35,9 +35,9 @@ def jacobian_sparsity(
     """Return which entries ∂f_a/∂u_i of a Jacobian may differ from zero at some u.
 
     Sets of inputs are propagated through the program that computes the derivative in a
-    direction du at u; the inputs are the entries of du. An entry that is false is
-    therefore zero for all u. If an operation is a loop, a branch or unknown, each of
-    its results counts as dependent on all its inputs.
+    direction du at u; the inputs are the entries of du. False therefore marks an entry
+    that is zero for all u. If an operation is a loop, a branch or unknown, each of its
+    results counts as dependent on all its inputs.
     """
 
     def push(du):

@@ -44,8 +44,8 @@ _KINDS = ("free", "ball", "slide", "hinge")
 class Layout:
     """The joints of a model, and the frame of each body relative to its last joint.
 
-    `source` is the `MjSpec` or `MjModel` that was read; films show its shapes.
-    The positions of the bodies with the names `moving` are parameters.
+    `source` is the `MjSpec` or `MjModel` that was read; films show its shapes. The
+    positions of the bodies named in `moving` are parameters.
 
     Layouts are compared by identity, so that a layout can be a static field of a
     `Robot`.
@@ -72,7 +72,7 @@ class Layout:
 def layout_of(model: Any, source: Any, moving: Collection[str]) -> Layout:
     """Read the kinematic tree.
 
-    The positions of the bodies with the names `moving` are parameters.
+    The positions of the bodies named in `moving` are parameters.
     """
     joints: list[Joint] = []
     bodies = [Frame(-1, np.eye(4))]
@@ -716,7 +716,7 @@ def _height_varies(
 ) -> bool:
     """Return whether the joints can change the height of a geom above the ground.
 
-    The positions of the bodies with the names `moving` can change too.
+    The positions of the bodies named in `moving` can change too.
     """
     if not isinstance(ground, Plane):
         return True
@@ -806,8 +806,8 @@ class _Rows:
         self.evaluate = jax.jit(self._evaluate)
 
     def _positions(self, q: PyTree[Array], args: Args) -> Array:
-        # Constraints on positions come first, so that of two dependent constraints the
-        # constraint on velocities is left out.
+        # Constraints on positions come first. If a constraint on velocities depends on
+        # one of them, the constraint on velocities is therefore left out.
         rows = [x.height(0.0, q, args)[None] for x in self.heights]
         if self.loop is not None:
             rows.append(self.loop(0.0, q, args))
@@ -878,7 +878,7 @@ def independent_rows(
 
     Such rows are left out if the others are independent at the pose at rest and at
     random poses. Otherwise all rows are kept, because rows that depend on each other
-    only in some poses are needed in the others.
+    only in some poses are needed in other poses.
     """
     all_rows = _Rows(space, contacts, loops, loop)
     rng, found = np.random.default_rng(1), []

@@ -50,9 +50,9 @@ class BallSpring(NamedTuple):
 class Mechanics(NamedTuple):
     """All numbers of a robot that its functions use.
 
-    Arrays with one entry for each velocity are in MuJoCo's order, which is the order of
-    the velocities of the system too. Arrays for tendons have one entry for each fixed
-    tendon.
+    Arrays with one entry for each velocity are in MuJoCo's order, which is also the
+    order of the velocities of the system. Arrays for tendons have one entry for each
+    fixed tendon.
     """
 
     joints: tuple[Joint, ...]
@@ -103,7 +103,7 @@ class Parameters(eqx.Module):
     controls: tuple[str, ...] | None = eqx.field(static=True)
 
     def replaced(self, kind: str, values: np.ndarray, args: Args, dtype: Any) -> Any:
-        """Return the array `values`, in which the values given in `args` are used."""
+        """Return `values`, with entries replaced by the values given in `args`."""
         given = given_in(args, kind)
         if not given:
             return jnp.asarray(values, dtype)
@@ -348,7 +348,7 @@ class Actuators(NamedTuple):
 
 
 def limited(x: Array, bounds: np.ndarray, smoothing: float) -> Array:
-    """Limit signals smoothly: x is unchanged to round-off well inside its bounds.
+    """Limit signals smoothly: well inside the bounds, x changes only by round-off.
 
     The width of the transition is `smoothing` times the range, or times the magnitude
     of the bound if there is only one.

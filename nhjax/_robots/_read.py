@@ -283,7 +283,7 @@ class Unsupported(NamedTuple):
 def check_supported(
     model: Any, ignore: Sequence[str], rolling: Collection[int]
 ) -> dict[str, set[int]]:
-    """Raise a `ValueError` if parts are neither supported nor ignored, and name them.
+    """Raise a `ValueError` that names the parts neither supported nor ignored.
 
     `rolling` has the numbers of the geoms that roll. Return the numbers of the
     actuators and of the equalities to leave out.
@@ -381,7 +381,7 @@ def _joints(model: Any) -> Iterator[Unsupported]:
                 f"joint {name!r}: gravity compensation by an actuator with a limit",
             )
         # Without actuators, MuJoCo omits gravity compensation in the coordinates of
-        # this joint only.
+        # this joint, but not of other joints.
         if model.jnt_actgravcomp[joint] and model.ngravcomp and not model.nu:
             yield Unsupported(
                 None,

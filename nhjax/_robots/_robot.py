@@ -93,9 +93,9 @@ class Robot(eqx.Module):
         **Returns:** a `State`.
 
         **Raises:** as `nhjax.initial_state`; `ValueError` for unknown joints;
-        `ValueError` if a constraint that was left out, because it follows from the
-        others, is violated in this state or no longer follows with the lengths in
-        `args` (not checked while JAX traces the call); `ShapeError` for wrong shapes.
+        `ValueError` if a left-out constraint is violated in this state, or does not
+        follow from the others with the lengths in `args` (not checked while JAX traces
+        the call); `ShapeError` for wrong shapes.
         """
         rest = jnp.asarray(self._rest, jnp.result_type(float))
         position = self._array("qpos", qpos, rest)
@@ -175,7 +175,7 @@ class Robot(eqx.Module):
 
         - `body`: the name of the body.
         - `q`: the configuration of one state.
-        - `args`: the parameters; those that are missing have the values of the file.
+        - `args`: the parameters; missing parameters have the values of the file.
 
         **Raises:** `ValueError` if there is no such body.
         """
@@ -256,7 +256,7 @@ def from_mujoco(
     """Read a robot from an MJCF or URDF file, with wheels that roll without slipping.
 
     MuJoCo's own compiler reads the model. The Lagrangian is the kinetic energy
-    ½ Σ tr(Ṫ J Ṫᵀ) of all bodies with poses T and pseudo-inertias J, with ½ a q̇² for
+    ½ Σ tr(Ṫ J Ṫᵀ) of all bodies with poses T and pseudo-inertias J, plus ½ a q̇² for
     each armature a, minus the potential energies of weight and springs. A free joint
     has coordinates in R³ x SO(3), and a ball joint in SO(3). All other joints together
     have coordinates in R^n. The equality constraints connect, weld, joint and tendon

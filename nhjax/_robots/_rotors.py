@@ -1,9 +1,9 @@
 """Wheels and rotors: bodies whose inertia does not change while their joint turns.
 
 Such a body at the end of a branch needs no frame of its own. Its inertia is added to
-the parent as if the body were fixed to it, and the rate s' of the joint adds
-s' h·ξ + ½ I s'² to the kinetic energy, with the twist ξ of the parent. The program of a
-robot on wheels then is as short as a program that is written by hand.
+its parent as if both were fixed together, and the joint rate s' adds s' h·ξ + ½ I s'²
+to the kinetic energy, with the twist ξ of the parent. The program of a robot on wheels
+is then as short as a program written by hand.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
 """Vectors and matrices as lists of scalars, without terms that are known to be zero.
 
-Most numbers in the frames of a robot are 0, 1 or -1. Products with them are left out
-while a function is traced, so that the program of a small robot is as short as a
-program that is written by hand. An entry is a Python float if it is known, and a traced
+Most numbers in the frames of a robot are 0, 1 or -1. Products with these numbers are
+left out while a function is traced, so that the program of a small robot is as short as
+a program written by hand. An entry is a Python float if it is known, and a traced
 scalar otherwise.
 """
 

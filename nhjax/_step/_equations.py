@@ -710,8 +710,8 @@ def stage_residual(
         another argument of `solve`.
 
     **Returns:** the residuals, of shape (k,) with as many entries as `x` has numbers,
-    in the units of momenta and of the constraints; and the values that were evaluated
-    on the way, which `solve` must return in the field `aux` of `Solved`.
+    in the units of momenta and of the constraints; and intermediate values, which
+    `solve` must return in the field `aux` of `Solved`.
 
     !!! example
 

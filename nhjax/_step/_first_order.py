@@ -1,7 +1,7 @@
 """The terms of order h in the Jacobian of the stage equations, and when to use them.
 
 If simplified Newton uses only the mass matrix and the constraints at the start of the
-step, it reduces the error by a factor O(h) an iteration. With `FirstOrderTerms` the
+step, each iteration reduces the error by a factor O(h). With `FirstOrderTerms` the
 factor is O(h²). These terms are the change of the mass matrix along the step, the
 derivatives of momenta with respect to positions, and the derivatives of forces with
 respect to velocities. `uses_first_order_terms` decides whether these terms are
@@ -26,10 +26,10 @@ from ._equations import StageEquations, StageUnknowns
 JacobianName: TypeAlias = Literal["leading", "first_order", "full"] | None
 
 # The terms make a step faster if the saved iterations cost more time than the terms.
-# This is so up to these numbers of stages, of coordinates, and of entries of the
-# responses of stages to multipliers, and without holonomic constraints. The larger
-# program of a larger system is no longer compiled to scalar operations if it computes
-# one trajectory, and is then several times slower.
+# This is the case without holonomic constraints, up to these numbers of stages, of
+# coordinates, and of entries of the responses of stages to multipliers. For one
+# trajectory of a larger system, the larger program is no longer compiled to scalar
+# operations, and is several times slower.
 _MOST_STAGES, _MOST_COORDINATES, _MOST_RESPONSES = 5, 6, 100
 
 
@@ -95,7 +95,7 @@ def has_force_slopes(
 
 def _has_terms(stages: StageEquations) -> bool:
     # On a vector space the terms vanish unless momenta depend on positions, or forces
-    # on velocities. This is decided from the traced functions of the system.
+    # on velocities. The traced functions of the system show whether they do.
     system, t, args = stages.system, stages.t, stages.args
     q, zero = stages.q, jnp.zeros_like(stages.p)
     by_position = jacobian_sparsity(
@@ -257,7 +257,8 @@ class _BodySlopes(NamedTuple):
 class _ChartSlopes(NamedTuple):
     """Derivatives at the start of a step, in its chart.
 
-    - `turning`: the rate of ∂Π/∂H if y changes at the rate v, from the change of dτ_y.
+    - `turning`: the rate of ∂Π/∂H if y changes at the rate v, due to the change of
+        dτ_y.
     - `momentum`, `force`, `body_force`: ∂Π/∂y, ∂F/∂H and ∂w/∂H.
     - `base`: the derivative of the constant term of Π with respect to the increment ξ
         of the step.

@@ -84,18 +84,18 @@ class LinearisedStep(eqx.Module):
     """The stage equations of one step, linearised at given stages.
 
     The chart depends on the increment ξ, and stage i is at the increment Ξ_i from the
-    start. With Ξ_i = h Σ a_ij H_j and ξ = h Σ b_j H_j the momenta Π_i, the chart forces
-    F_i and the transported forces n_i of the stages change by
+    start. With Ξ_i = h Σ a_ij H_j and ξ = h Σ b_j H_j, the momenta Π_i of the stages,
+    their chart forces F_i and their transported forces n_i change by
 
     δΠ_i = ∂Π_i/∂H δH_i + ∂Π_i/∂Ξ δΞ_i + ∂Π_i/∂ξ δξ,
 
-    and likewise F_i and n_i, where ∂F/∂Ξ is the stiffness, including the change of the
-    reactions Bᵀλ with positions, and ∂F/∂H is the damping. The residuals of the stages
-    are r_i = Π_i - base(ξ, h Σ b_j n_j, h Σ b_j F_j) - h Σ â_ij F_j. Their changes are
-    a matrix of s n rows times δH. This matrix is inverted by blocks of n rows. It does
-    not split into smaller systems, since the matrices A and Â of the method do not
-    commute. The changes of the nodes follow from the changes of the stages, and the
-    multipliers from a Schur complement.
+    and likewise for F_i and n_i. Here ∂F/∂Ξ is the stiffness, including the change of
+    the reactions Bᵀλ with positions, and ∂F/∂H is the damping. The residuals of the
+    stages are r_i = Π_i - base(ξ, h Σ b_j n_j, h Σ b_j F_j) - h Σ â_ij F_j. Their
+    changes are a matrix of s n rows times δH. This matrix is inverted by blocks of n
+    rows. It does not split into smaller systems, since the matrices A and Â of the
+    method do not commute. The changes of the nodes follow from the changes of the
+    stages, and the multipliers from a Schur complement.
 
     For a Hamiltonian system δμ_i = (∂v_i/∂μ)⁻¹ (δH_i - ∂v_i/∂Ξ δΞ_i - ∂v_i/∂ξ δξ), and
     the derivatives above are total derivatives.
@@ -271,8 +271,9 @@ def linearised_step(
 ) -> LinearisedStep:
     """Linearise the equations of stages and nodes at the stages x.
 
-    With `has_impulse_slopes` the result includes the change of the direction of the
-    impulse at the end, which is small, since it is proportional to the impulse.
+    With `has_impulse_slopes` the result includes the effect of the changing direction
+    of the impulse at the end. This effect is small, as it is proportional to the
+    impulse.
     """
     h, path, flat = stages.h, _path(stages, x), stages.manifold.is_flat
     a_hat, b = stages.coefficients("a_hat"), stages.coefficients("b")[None]

@@ -41,7 +41,8 @@ class Invariants(eqx.Module):
         for the energy of the system.
     - `value`: the k values.
     - `least_sizes`: the measured round-off of the functions at the start of the run,
-        divided by the unit round-off. Constants that cancel contribute to it.
+        divided by the unit round-off. It includes the round-off of constants that
+        cancel.
     - `least_part`: zero if the mass matrix is definite, otherwise `LEAST_PART`.
     """
 

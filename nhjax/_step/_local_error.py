@@ -1,14 +1,14 @@
 """An estimate of the error of one step, from the forces and velocities at its stages.
 
-The estimate needs no further evaluations. The forces of the stages sample the rate of
-the momentum at s points of the step. Multiplied by the inverse mass matrix at the start
-of the step, they sample the rate of the fibre coordinate u. The Legendre coefficients
-of these samples give the sizes U_k = |h^k u^(k)| of the derivatives of u, where k is
-1, ..., s. Velocities can also change where momenta do not: if the mass matrix depends
-on time, or when a free body turns. Therefore a second estimate of each U_k is computed
-from the velocities of the stages and the accelerations at both ends, and the larger
-estimate is used. On a group, the second estimate uses the velocities in the chart
-without the accelerations, and exists for k < s only.
+The estimate needs no further evaluations of forces. The forces of the stages sample the
+rate of the momentum at s points of the step. Multiplied by the inverse mass matrix at
+the start of the step, they sample the rate of the fibre coordinate u. The Legendre
+coefficients of these samples give the sizes U_k = |h^k u^(k)| of the derivatives of u,
+where k is 1, ..., s. Velocities can also change where momenta do not: if the mass
+matrix depends on time, or when a free body turns. Therefore a second estimate of each
+U_k is computed from the velocities of the stages and the accelerations at both ends,
+and the larger estimate is used. On a group, the second estimate uses the velocities in
+the chart without the accelerations, and exists for k < s only.
 
 The error of a method of order p is a multiple of U_{p+1}, a derivative of higher order
 than the samples determine. From order to order, derivatives grow by a factor r. The
@@ -45,9 +45,10 @@ from ._step import StepOutcome, StepState
 
 
 # The error of a step is the error of the quadrature with the weights b, times `_GROWTH`
-# to the power p + 1 - s, the number of orders that the samples do not determine. The
-# factor a is `_GROWTH_BY_COMMUTATOR` times the eigenvalue of ad(h v). Both values were
-# fitted to the errors of steps of the gallery (`benchmarks.adaptive_steps`).
+# to the power p + 1 - s, which is the number of orders that the samples do not
+# determine. The factor a is `_GROWTH_BY_COMMUTATOR` times the eigenvalue of ad(h v).
+# Both values were fitted to the errors of steps of the gallery
+# (`benchmarks.adaptive_steps`).
 _GROWTH, _GROWTH_BY_COMMUTATOR = 2.8, 1.2
 # Velocities in a chart also change because of the chart. Therefore their derivatives
 # are multiplied by this factor, which was fitted in the same way.
@@ -130,7 +131,7 @@ def local_error(
 
 
 def _largest(by_force: Array, by_velocity: Array) -> Float[Array, " s"]:
-    """Return the size of each derivative, a row, as the larger of two estimates."""
+    """Return the size of each derivative (a row), the larger of two estimates."""
     both = jnp.stack([by_force, by_velocity])
     return jnp.max(jnp.sqrt(jnp.mean(both**2, axis=2)), axis=0)
 
@@ -179,7 +180,7 @@ def _extrapolated(
     last = sizes[-1]
     growth = (last / first) ** (1 / (number - 1))
     if number > 2:
-        # A derivative can vanish, but not at the same time as the next one.
+        # A derivative can vanish, but not together with the derivative of next order.
         other = (sizes[-2] / first) ** (1 / (number - 2))
         growth = jnp.maximum(growth, jnp.minimum(other, known_growth))
         last = jnp.sqrt(last**2 + (growth * sizes[-2]) ** 2)

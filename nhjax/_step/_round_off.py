@@ -13,8 +13,8 @@ from .._system import FunctionNoise, Linearisation
 
 # When the increments of the stages stop falling, they can be six times as large as the
 # round-off that the functions of a system cause in them. Increments count as noise up
-# to `NOISE_UNITS` = 400 times the unit round-off times a size. With this fraction, they
-# count as noise up to 50 times the measured round-off.
+# to `NOISE_UNITS` = 400 times the unit round-off times a size. With the fraction
+# `PART`, they count as noise up to 50 times the measured round-off.
 PART = 1 / 8
 
 
@@ -59,11 +59,11 @@ def magnifications(method: AbstractMethod) -> tuple[float, float]:
 
     The change h N⁻¹ R δΛ in a step is larger, by the computed factor, than the change
     that would correct the error of a single constraint. The factor is the largest
-    Euclidean norm of a row of E (A_{2:} E)⁻¹ for nonholonomic constraints, and of the
-    inverse of the matrix with the rows A_{2:} Â and b for holonomic constraints. A_{2:}
-    is A without its first row, and E belongs to the closure of the multiplier.
-    Pseudo-inverses are used, because a method that does not support one of the two
-    kinds of constraints can have a singular matrix.
+    Euclidean norm of a row of a matrix. For nonholonomic constraints this matrix is
+    E (A_{2:} E)⁻¹. For holonomic constraints it is the inverse of the matrix with the
+    rows A_{2:} Â and b. A_{2:} is A without its first row, and E belongs to the closure
+    of the multiplier. Pseudo-inverses are used, because a method that does not support
+    one of the two kinds of constraints can have a singular matrix.
 
     **Returns:** the factor for nonholonomic and the factor for holonomic constraints.
     """

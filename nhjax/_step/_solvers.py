@@ -113,9 +113,9 @@ class SimplifiedNewton(AbstractStageSolver):
 
     - `max_iterations`: the number of iterations after which a step counts as failed.
         With the fallback, Newton's method takes over after at most 100 iterations.
-    - `tolerance`: the size of the increment, relative to the velocities, at which to
-        stop. The default, 0, iterates to round-off. Changing the tolerance does not
-        recompile.
+    - `tolerance`: the iteration stops at an increment of at most this size, relative
+        to the velocities. The default, 0, iterates to round-off. Changing the tolerance
+        does not recompile.
     - `fallback`: whether `nhjax.Newton()` takes over a step that is not solved: True,
         False, or None. None, the default, uses the fallback only in plain calls, as
         described above. Derivatives of a run with the fallback use the exact Jacobian,
@@ -126,10 +126,10 @@ class SimplifiedNewton(AbstractStageSolver):
         - `"full"`, the full Jacobian, for machines whose steps need many iterations or
             are not solved.
         - None, the default: the terms of order h are included if they reduce the run
-            time. They do so with s <= 5 stages, n <= 6 coordinates and m constraints
-            with s (s - 1) n m <= 100, all nonholonomic. The terms are not available for
-            Hamiltonian systems, redundant constraints, and so many constraints that
-            they are stored as sparse matrices.
+            time. They do so with s <= 5 stages, n <= 6 coordinates and m constraints,
+            all nonholonomic, with s (s - 1) n m <= 100. The terms are not available for
+            Hamiltonian systems, for redundant constraints, and for so many constraints
+            that their matrices are sparse.
 
     !!! example
 
@@ -192,7 +192,7 @@ class SimplifiedNewton(AbstractStageSolver):
     ) -> FrozenNewtonMap:
         """Build the iteration of `solve` with constraint Jacobians at the solution.
 
-        With the fallback this is the iteration of Newton's method, which contracts also
+        With the fallback this is the iteration of Newton's method, which also contracts
         in steps that Newton's method had to solve.
         """
         if self.fallback:
@@ -327,9 +327,9 @@ def _solved(
 
     `push` multiplies by J. The equations are eliminated by blocks, with one round of
     refinement for the first r. Rows are not exchanged between blocks, so that the
-    elimination can lose digits although J is regular. The refinement detects such a
-    loss. The equations are then solved by elimination with partial pivoting of all
-    rows. Larger systems are solved by `jnp.linalg.solve`.
+    elimination can lose digits even if J is regular. If the refinement detects such a
+    loss, the equations are solved by elimination with partial pivoting of all rows.
+    Larger systems are solved by `jnp.linalg.solve`.
     """
     flat = jnp.stack([ravel_pytree(r)[0] for r in rights])
     _, residuals = ravel_pytree(rights[0])
@@ -442,15 +442,15 @@ def fibre_coordinate_scale(
     """Estimate the size of the fibre coordinates of a step and their round-off.
 
     The size is the size of the coordinates at the starting values x0 plus the changes
-    by forces and by reactions over the step, which may cancel. For a system at rest
-    only these changes remain.
+    by forces and by reactions over the step, which may cancel each other. For a system
+    at rest only these changes remain.
 
     The additional round-off has these parts:
 
-    - The round-off of positions, through the constraints. For holonomic constraints it
-        is divided by h. For nonholonomic constraints it matters if a coordinate has
-        grown large, such as the heading of a car after many turns.
-    - The round-off of invariants, through the impulses that keep them.
+    - The round-off of positions, which acts through the constraints. For holonomic
+        constraints it is divided by h. For nonholonomic constraints it matters if a
+        coordinate has grown large, such as the heading of a car after many turns.
+    - The round-off of invariants, which acts through the impulses that keep them.
 
     The additional round-off is at least `PART` times the measured round-off of the
     functions of the system.

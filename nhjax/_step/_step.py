@@ -114,7 +114,7 @@ class StepRecord(eqx.Module):
 
     - `start`: the state at the start of the step.
     - `velocity`, `force`, `multiplier`: the values at the s stages.
-    - `interval`: the start and the size of the step, in a run whose steps differ.
+    - `interval`: the start and the size of the step, in a run with variable steps.
     """
 
     start: State
@@ -483,9 +483,9 @@ def error_ratios(
     The state changes by h Σ b_j (H^j, N⁻¹ n^j), with the velocities H^j and the forces
     n^j of the stages, and with N = ∂p/∂u. A second quadrature leaves out the last node.
     The difference of the two quadratures is the same sum with the weights
-    `method.embedded_difference`. The first ratio divides the difference in positions
-    per h by the change of the state. The second ratio divides the difference in fibre
-    coordinates by the same change. See `estimated_error`.
+    `method.embedded_difference`. The first ratio is the difference in positions,
+    divided by h and by the change of the state. The second ratio is the difference in
+    fibre coordinates, divided by the same change. See `estimated_error`.
 
     **Arguments:**
 
@@ -520,7 +520,7 @@ def error_ratios(
     if stages.constrained:
         # Multipliers of single stages may be wrong although their sum is right.
         # Therefore the part of the difference that violates the constraints is left
-        # out; the step satisfies the constraints.
+        # out: the error of a step, which satisfies the constraints, has no such part.
         excess = lin.delassus_inverse.matvec(lin.jacobian.matvec(gained))
         gained = gained - lin.reaction.matvec(excess)
     return relative(jnp.stack([max_norm(moved), max_norm(gained)]), whole)
@@ -593,8 +593,8 @@ class ImplicitStep(AbstractImplicitFunction[StepArguments, StepOutcome]):
             iteration = self.frozen_iteration(arguments, x)
             return self.changes(iteration, perturbed, fixed, x, rates, ok)
 
-        # With `jax.checkpoint`, reverse mode stores only states and stages. It computes
-        # the factors of the Jacobian in its own pass.
+        # With `jax.checkpoint`, reverse mode stores only states and stages. The factors
+        # of the Jacobian are computed again in the backward pass.
         changes = jax.checkpoint(changes, prevent_cse=False)
         return tangent_of_outcome(solution, changes(perturbed, solution.stages, rates))
 
@@ -630,8 +630,8 @@ class ImplicitStep(AbstractImplicitFunction[StepArguments, StepOutcome]):
             return _end(eqx.combine(perturbed, fixed), self.method, x)
 
         rates = zero_unless(ok, rates)
-        # The solver started from a good guess. This iteration starts from zero, so it
-        # may take twice as many iterations.
+        # The solver started from a good guess. This iteration starts from zero, and is
+        # therefore allowed twice as many iterations.
         limit = 2 * self.stage_solver.max_iterations
         dx = fixed_point_tangent(
             iteration, perturbed, rates, x, frozen.units, max_iterations=limit

@@ -29,7 +29,7 @@ Kind: TypeAlias = type | tuple[type, ...]
 
 
 def check_type(name: str, x: object, kind: Kind, advice: str = "") -> None:
-    """Raise a `TypeError` unless `x` is an instance of `kind`, a type or several."""
+    """Raise a `TypeError` unless `x` is an instance of `kind`, one or more types."""
     if isinstance(x, kind):
         return
     if isinstance(x, type):

@@ -64,8 +64,8 @@ class Linearisation(eqx.Module):
     N⁻¹ R = K⁻¹ Bᵀ with the fibre Hessian K = D2D2L or D2D2H. If the force depends on
     the multipliers, R includes ∂F/∂λ.
 
-    The Jacobian of the stage equations has the same matrices. Inverses are computed
-    once, and later computations multiply by them: the matrices are tiny, and a
+    The Jacobian of the stage equations contains the same matrices. Inverses are
+    computed once, and later computations multiply by them: the matrices are tiny, and a
     triangular solve inside an iteration costs far more than a product. The matrices of
     many constraints are sparse if each constraint shares coordinates with few others.
     """
@@ -89,7 +89,7 @@ class Linearisation(eqx.Module):
 
     @property
     def is_sparse(self) -> bool:
-        """Return whether the matrices of the constraints are stored as sparse ones."""
+        """Return whether sparse matrices are stored for the constraints."""
         return self.jacobian.pattern is not None
 
     @property

@@ -39,7 +39,7 @@ from ._arguments import (
 
 
 class State(eqx.Module):
-    """The state of a mechanical system at one time, or a trajectory of them.
+    """The state of a mechanical system at one time, or the states of a trajectory.
 
     - `q`: the configuration, shape (n,); on a group an element, on a product of groups
         a tuple of elements.
@@ -50,7 +50,7 @@ class State(eqx.Module):
         gives the components in the body frame (the identity on R^n). A Hamiltonian
         system has ♭_H D2Ψ in place of D2Φ, with ♭_H = (D2D2H)⁻¹.
 
-    Create one with `nhjax.initial_state`, which makes the four parts consistent.
+    Create a state with `nhjax.initial_state`, which makes the four parts consistent.
     """
 
     q: PyTree[Array]
@@ -167,8 +167,8 @@ class AbstractMechanicalSystem(eqx.Module):
     fibre_coordinate_name: eqx.AbstractClassVar[Literal["v", "p"]]
 
     def __post_init__(self):
-        # This is determined once, since programs replace the functions by traced
-        # functions, which do not have the signatures of the user's functions.
+        # The signature of the force is read once, here, because programs replace the
+        # functions by traced functions with other signatures.
         self.force_takes_multipliers = takes_multipliers(as_given(self.force))
 
     def __check_init__(self):
@@ -256,7 +256,7 @@ class AbstractMechanicalSystem(eqx.Module):
         return self.named(name)(*arguments)
 
     def named(self, name: str) -> "NamedFunction":
-        """Return a function of the system whose errors say which one it is."""
+        """Return a function of the system whose errors name the function."""
         called = f"{name}({', '.join(self.signatures()[name])})"
         return NamedFunction(getattr(self, name), called)
 
@@ -425,8 +425,8 @@ class LagrangianSystem(AbstractMechanicalSystem):
     Automatic differentiation computes all derivatives. If a function is an
     `equinox.Module`, its array leaves are parameters of the system, and gradients with
     respect to the system include them. A system can be an argument of `jax.jit`,
-    `jax.vmap` and `jax.grad`: Python functions are a part of its structure, and a
-    system with another function recompiles.
+    `jax.vmap` and `jax.grad`: Python functions are a part of its structure, so that
+    another function needs a new compilation.
 
     Values that the functions read besides their arguments (globals, variables of
     enclosing functions, attributes of objects) are compiled in. `integrate` and
@@ -452,12 +452,12 @@ class LagrangianSystem(AbstractMechanicalSystem):
     - `manifold`: the configuration manifold; by default R^n with the n of the state.
     - `constraints`: `"independent"` refuses dependent constraints. `"redundant"` allows
         constraints that follow from others, also nonholonomic constraints that follow
-        from holonomic ones. Many multipliers then have the same reaction. nhjax chooses
-        the multipliers with the least Σ |λ_a B_a|², where |λ_a B_a| is the size of the
-        reaction of one constraint in the metric M⁻¹. The multiplier of a nonholonomic
-        constraint is zero if the constraint follows from holonomic constraints.
-        `nhjax.Motion.is_unique` says which multipliers the equations determine.
-        `docs/systems.md` has the details.
+        from holonomic ones. Different multipliers then give the same reaction. nhjax
+        chooses the multipliers with the least Σ |λ_a B_a|², where |λ_a B_a| is the size
+        of the reaction of one constraint in the metric M⁻¹. The multiplier of a
+        nonholonomic constraint is zero if the constraint follows from holonomic
+        constraints. `nhjax.Motion.is_unique` says which multipliers the equations
+        determine. `docs/systems.md` has the details.
     - `coordinates`: a tuple of the names of the n coordinates, for
         `Solution.to_xarray` and for `keep_q`, `keep_v` and `keep_p` of `initial_state`;
         None by default.

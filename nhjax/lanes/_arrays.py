@@ -116,8 +116,8 @@ def _unstack(
     rows = range(values[0].shape[axis])
 
     def row(index: int) -> ArrayValue:
-        # A slice is used, because an index into an array of one axis would not be a
-        # view.
+        # A slice is used, because indexing an array with one axis returns an element
+        # instead of a view.
         part = (slice(None),) * axis + (slice(index, index + 1),)
         return rearranged(builder, values[0], lambda x: x[part].squeeze(axis))
 
@@ -551,7 +551,7 @@ GATHERS: dict[str, Operation] = {
 
 
 def _extreme(dtype: str, sign: int) -> Any:
-    """Return the largest number of a dtype, or the smallest number for the sign -1."""
+    """Return the largest number of a dtype, or the smallest if the sign is -1."""
     if is_float(dtype):
         return sign * np.inf
     if dtype == "bool":

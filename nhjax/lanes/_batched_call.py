@@ -1,10 +1,10 @@
-"""The operation that stands for a program of many members, and its rules.
+"""The operation that runs a program for many members, and its rules in JAX.
 
-`jax.vmap` of a compiled program is one operation, `batched_call`, with the program of
-one member. On the CPU the members are vectorised (SIMD) by this compiler. If it cannot
-compile the program, and the options allow it, XLA compiles the program of one member to
-a single kernel, which runs for one member after the other. On other devices, and if
-neither is possible, JAX batches the program.
+`jax.vmap` of a compiled program is one operation, `batched_call`, which contains the
+program of one member. On the CPU the members are vectorised (SIMD) by this compiler. If
+it cannot compile the program, and the options allow it, XLA compiles the program of one
+member to a single kernel, which runs for one member after the other. In all other
+cases, and on other devices, JAX batches the program.
 """
 
 from functools import partial
@@ -78,7 +78,7 @@ batching.primitive_batchers[kernel] = _vmap_of_kernel
 
 
 def _vmap_of_batched_call(operands, axes, *, program, is_batched, options):
-    """Flatten the new axis of members and the present axis of members to one axis."""
+    """Flatten the new and the existing axis of members to one axis."""
     pairs = list(zip(operands, axes, strict=True))
     size = next(x.shape[axis] for x, axis in pairs if axis is not None)
     member_shapes = [aval.shape for aval in program.in_avals]

@@ -277,8 +277,9 @@ def _split(index: Node | None, offset: int) -> tuple[Node | None, int]:
 
 
 def _origin(flat: np.ndarray) -> Buffer | None:
-    """Return the memory that contains exactly these numbers and is no longer changed,
-    if the numbers were loaded from such memory.
+    """Return the memory from which exactly these numbers were loaded, in this order.
+
+    The result is `None` if there is no such memory, or if it may still change.
     """
     first = flat[0]
     if first.op != "load" or first.args or not first.attr[0].is_fixed:
@@ -316,11 +317,11 @@ class Builder:
         self.path: list[int] = []
         # For the path of each loop, the positions of carried numbers that change.
         self.changing: dict[tuple[int, ...], set[int]] = {}
-        # For the carried numbers of a loop that is continued: the constants with which
-        # the numbers started when the loop began.
+        # For each number carried by a loop that continues an earlier loop: the constant
+        # with which the number started in the earlier loop.
         self.loop_starts: dict[Node, Node] = {}
         self.functions = Functions()
-        # Whether called programs are written out at present, and do not become
+        # Whether called programs are currently written out, instead of becoming
         # functions.
         self.is_written_out = False
         self._last_uses: dict[int, tuple[Any, list[list[Any]]]] = {}

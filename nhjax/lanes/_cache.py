@@ -1,11 +1,11 @@
 """The cache of native code on disk, and the keys of its entries.
 
-The key of a program is a hash of all that its code depends on: the jaxpr with its
-constants, the options of compilation, the machine, and the versions of this compiler,
-of LLVM, of JAX and of NumPy. The key is computed without the graph of the program. This
-takes much less time than compilation. If a parameter of an operation has a type that is
-not known here, such as a Python function, the program gets no key, and is compiled in
-each process.
+The key of a program is a hash of everything that its code depends on: the jaxpr with
+its constants, the options of compilation, the machine, and the versions of this
+compiler, of LLVM, of JAX and of NumPy. The key is computed without the graph of the
+program, which takes much less time than compilation. If a parameter of an operation has
+a type that is not known here, such as a Python function, the program gets no key, and
+is compiled in each process.
 
 The cache follows JAX's options for its persistent compilation cache. It is a folder in
 JAX's directory, with one file for each program. A file contains the key, a checksum and
@@ -179,7 +179,7 @@ _SOURCES = _hash_of_sources()
 
 @lru_cache(maxsize=1)
 def _environment() -> tuple[str, ...]:
-    """Return all that code depends on besides its program."""
+    """Return everything that code depends on besides its program."""
     return _SOURCES, *host(), version(), jax.__version__, np.__version__
 
 

@@ -45,8 +45,8 @@ from ._writer import (
 _ALIGNMENT = 64
 _LARGEST_STACK = 2**16
 _LARGEST_SCRATCH = 2**26
-# A side of a divergent branch that no member takes is jumped over, if the side has more
-# nodes than this. Shorter sides are always computed.
+# If a side of a divergent branch has more nodes than this, it is skipped when no member
+# takes it. Shorter sides are always computed.
 _LONGEST_SIDE = 24
 _STATEMENTS = ("loop", "branch", "store", "load")
 _ALL = "splat (i1 true)"
@@ -209,8 +209,8 @@ def mark_divergent(live: LiveNodes, is_batched: tuple[bool, ...]) -> None:
     """Mark the nodes and the memory whose values differ between members.
 
     Only members that are still running are compared. In a loop that members leave at
-    different times, a counter that starts equal is uniform inside the loop, but its
-    last value is divergent after the loop.
+    different times, a counter with equal first values is uniform inside the loop, but
+    its last value is divergent after the loop.
     """
     for buffer in live.buffers:
         if buffer.kind == "operand":
@@ -368,9 +368,9 @@ class _Functions:
         floats = [x for x in dtypes if is_float(x)]
         if width == 1 and len(floats) in (3, 4):
             # On x86-64 LLVM returns a third and a fourth float in registers of the x87
-            # unit. Without optimisation, it does so with instructions that do not
-            # exist. Five floats are returned in memory, so unused floats are added to
-            # get five.
+            # unit. Without optimisation, the instructions that it writes for
+            # this do not exist. It returns five floats in memory, so unused floats are
+            # added to get five.
             dtypes += floats[: 5 - len(floats)]
         return result_type([vector(scalar_type(x), width) for x in dtypes])
 
@@ -565,7 +565,7 @@ class _Regions:
             self._one_side(branch)
 
     def _one_side(self, branch: BranchInfo) -> None:
-        """Write a branch of which all members take the same side, as a jump."""
+        """Write a branch as a jump, because all members take the same side."""
         writer, tag = self.writer, self._next_label()
         predicate = _operand(writer, branch.predicate, False)
         writer.add(f"br i1 {predicate}, label %{tag}.yes, label %{tag}.no")
@@ -619,7 +619,7 @@ class _Regions:
             _define(writer, result, writer.value(choice))
 
     def _guarded(self, nodes: list[Node], outs: list[Node], mask: str) -> list[str]:
-        """Write a side that is jumped over if no member takes it."""
+        """Write a side that is skipped if no member takes it."""
         writer, tag = self.writer, self._next_label()
         some, before = writer.any_of(mask), writer.block
         writer.add(f"br i1 {some}, label %{tag}.side, label %{tag}.join")

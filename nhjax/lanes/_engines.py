@@ -1,11 +1,11 @@
 """The engines that can compile a program on the CPU, and the reasons against them.
 
 XLA runs a program on the CPU as a sequence of kernels. Starting a kernel takes about 50
-ns, as long as the arithmetic of tens of numbers, and one iteration of a stage solver is
-about fifty such kernels. If a called computation is marked as small, XLA compiles it to
-a single kernel, including its loops. On the gallery's systems this is three to five
+ns, as long as arithmetic with tens of numbers. One iteration of a stage solver consists
+of about fifty such kernels. If a called computation is marked as small, XLA compiles it
+to a single kernel, including its loops. On the gallery's systems this is three to five
 times faster than a sequence of kernels. The mark is internal to XLA, and its meaning
-may change. Without the mark, as on other devices, the results are the same.
+may change. The results are the same without the mark, which only the CPU uses.
 """
 
 import os
@@ -113,8 +113,8 @@ def is_within_kernel() -> bool:
     return _within.get()
 
 
-# Whether the surrounding program is left to XLA. The operations `batched_call` in this
-# program are then left to XLA too.
+# Whether the surrounding program is left to XLA. If so, its operations `batched_call`
+# are left to XLA too.
 _is_part = ContextVar("is_part", default=False)
 
 

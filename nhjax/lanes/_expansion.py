@@ -1,10 +1,10 @@
 """Operations that are replaced by programs of simpler operations before compilation.
 
 Factorisations of small matrices are written out, since XLA calls a library for them.
-Under `vmap`, a loop can have a condition for each member; it is replaced by a loop with
-a single condition. Operations of other libraries, such as equinox's operations for
-loops, are replaced by the program of their implementation. JAX runs this implementation
-if such an operation is called outside of transformations.
+Under `vmap`, a loop can have a condition for each member. Such a loop is replaced by a
+loop with a single condition. Operations of other libraries, such as equinox's
+operations for loops, are replaced by the program of their implementation. JAX runs this
+implementation if such an operation is called outside of transformations.
 """
 
 import math
@@ -114,8 +114,8 @@ def _holds_programs(value: Any) -> bool:
 def is_foreign(primitive: Any) -> bool:
     """Return whether a library other than JAX has defined an operation.
 
-    The implementation of an operation of JAX is a function in a module of JAX, which
-    compiles and runs the operation.
+    An operation of JAX is implemented by a function in a module of JAX, which compiles
+    and runs the operation.
     """
     implementation = primitive.impl
     while isinstance(implementation, partial):
@@ -413,7 +413,7 @@ def _while_any(
     cond_nconsts: int,
     body_nconsts: int,
 ) -> list[Any]:
-    """Iterate while any member goes on; the values of other members do not change."""
+    """Iterate while any member continues; values of finished members do not change."""
     test, body = map(jax.extend.core.jaxpr_as_fun, (cond_jaxpr, body_jaxpr))
     of_test, of_body = operands[:cond_nconsts], operands[cond_nconsts:][:body_nconsts]
 

@@ -788,9 +788,9 @@ class Functions:
 
 
 def _unify(one: Function, own: _Pattern, general: Function, wider: _Pattern) -> None:
-    """Let `one` call `general`, if this is worthwhile.
+    """Let `one` call `general`, if the longer code costs little.
 
-    `general` must have fewer constants, and must be hardly longer.
+    `general` must have fewer constants, and must not be much longer.
     """
     pairs = list(zip(own, wider, strict=True))
     is_wider = all(b is None or a is b for a, b in pairs)
@@ -816,7 +816,7 @@ def needed(outs: Sequence[Node]) -> list[Node]:
 def parameters_for(
     graph: Graph, region: Region, values: Sequence[np.ndarray]
 ) -> tuple[list[np.ndarray], list[Node]]:
-    """Return arrays of parameters in place of the numbers that are not constant."""
+    """Replace numbers that are not constant by parameters; return both."""
     arrays, parameters = [], []
     for value in values:
         array = np.empty(value.size, object)

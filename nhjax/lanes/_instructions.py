@@ -80,7 +80,7 @@ def _div(writer: Writer, node: Node, width: int, args: list[str]) -> str:
 
 
 def _integer_division(writer: Writer, node: Node, width: int, args: list[str]) -> str:
-    """Divide integers with XLA's results for divisors that may trap in LLVM.
+    """Divide integers; the results are XLA's also for divisors that may trap in LLVM.
 
     These divisors are zero, and -1 if the quotient overflows.
     """

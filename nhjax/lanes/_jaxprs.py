@@ -2,10 +2,10 @@
 
 `fits_one_kernel` decides by the kinds and sizes of operations whether XLA can compile a
 program to a single kernel of the CPU. `cse_dce` removes repeated operations
-(common-subexpression elimination) and unused operations (dead-code elimination). This
-saves time, because derivatives also compute the function itself: a traced program
-contains many operations several times, and each transformation and the compiler would
-process every copy.
+(common-subexpression elimination) and unused operations (dead-code elimination). A
+traced program repeats many operations, because derivatives also compute the function
+itself. Without `cse_dce`, each transformation and the compiler would process every
+copy.
 """
 
 import itertools
@@ -47,7 +47,7 @@ _MOVING = """
 """.split()  # noqa: SIM905
 ARITHMETIC_AND_SHAPES = (*ELEMENTWISE, *_REDUCING, *_SHAPING, *_MOVING)
 _ARITHMETIC = {"add", "add_any", "div", "mul", "neg", "sub"}
-# nhjax's own operation, which is lowered to arithmetic and shapes.
+# nhjax's own operation, which is lowered to broadcasts, a product and a sum.
 SMALL_PRODUCT = "small_product"
 # nhjax's own operation, which writes a row of an array.
 WRITE_ROW = "write_row"
@@ -168,8 +168,8 @@ def num_results(program: Any) -> int:
     return count
 
 
-# Only the operations in this set are removed when they are repeated. They have no
-# state, which random numbers have, and no parameters that a user chooses.
+# Repeated operations are removed only if they are in this set. They have no state
+# (unlike random numbers), and no parameters that a user chooses.
 _REPEATABLE = frozenset(
     (*ARITHMETIC_AND_SHAPES, "dot_general", "gather", KEPT_CALL, SMALL_PRODUCT)
 )

@@ -1,4 +1,4 @@
-"""The operation that stands for a program compiled as a whole, and its derivatives.
+"""The operation for a program that is compiled as a whole, and its derivatives.
 
 `run_program` binds a program as one operation, `cpu_kernel`. The forward derivative of
 this operation is a pair of such operations: one computes the values, and the other is
@@ -31,9 +31,9 @@ class CompileOptions(NamedTuple):
         is compiled in less time, to slower code.
     - `engines`: the engines that may compile the program and its derivatives, in the
         order in which they are tried.
-    - `xla_below`: a program with fewer operations than this is compiled by XLA if XLA
-        compiles the program around it, because a call of native code from a program of
-        XLA takes longer than a few operations.
+    - `xla_below`: inside a program that XLA compiles, XLA also compiles programs with
+        fewer operations than this, because a call of native code from a program of XLA
+        takes longer than a few operations.
     - `note`: text that the function `engines` adds to the reason.
     """
 

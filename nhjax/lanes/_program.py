@@ -178,7 +178,8 @@ LONGEST_UNROLLED_SCAN = 8
 # Programs with more nodes than `MOST_NODES` are refused, unless they have on average at
 # most `NODES_PER_OPERATION` nodes for each operation of JAX. LLVM takes about 10 s for
 # this number of nodes, and minutes for more. XLA does not unroll operations on arrays:
-# it takes a few seconds for large arrays, but longer than LLVM for many small arrays.
+# it compiles programs with large arrays in a few seconds, but takes longer than LLVM if
+# there are many small arrays.
 MOST_NODES, NODES_PER_OPERATION = 100_000, 40
 
 OPERATIONS: dict[str, Operation] = {
@@ -383,8 +384,8 @@ def _name(*texts: str) -> str:
 # with 2 to 8 stages, and on larger systems, show that its code is faster than XLA's if
 # the root mean square of array sizes is at most `_SMALL_ARRAYS`. For larger arrays XLA
 # is often faster, since it uses vectors for operations on arrays also in a single run.
-# But XLA takes more than 1 ms to compile an operation. Therefore, between the two sizes
-# XLA compiles only short programs. Above `_LARGE_ARRAYS` it compiles all programs.
+# But XLA takes more than 1 ms to compile an operation. Therefore, up to `_LARGE_ARRAYS`
+# XLA compiles only short programs. Above this size it compiles all programs.
 _SMALL_ARRAYS, _LARGE_ARRAYS = 40, 110
 _SHORT_PROGRAM = 2800
 # A program can have large arrays in operations that are computed once in each step, and

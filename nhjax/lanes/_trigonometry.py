@@ -1,9 +1,8 @@
 """Sine, cosine and tangent, and their inverses, for vectors of float64.
 
 With n the integer nearest to x / (pi / 2), x = n pi / 2 + r and |r| <= pi / 4. Sine and
-cosine are computed by one function: each needs both polynomials anyway, because n
-differs between the members of a vector, and LLVM merges two calls with the same
-argument.
+cosine are computed by one function. Each needs both polynomials anyway, because n
+differs between the members of a vector. LLVM merges two calls with the same argument.
 
 Large arguments are reduced by the method of Payne and Hanek. The number x = m 2^e, with
 an integer m of 53 bits, is multiplied by 2 / pi. The binary digits of 2 / pi that add

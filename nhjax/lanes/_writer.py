@@ -2,8 +2,8 @@
 
 Kernels and elementary functions are written by one class, `Writer`, which collects the
 instructions of one function. Its method `value` appends an instruction that is given as
-text and returns the name of the result. The code that writes kernels uses this method
-directly, which takes less time: a kernel has 10^4 instructions or more.
+text and returns the name of the result. The code that writes kernels calls this method
+directly to save time, because a kernel has 10^4 instructions or more.
 
 Formulas are written with `Value`, the name of a result and its type. The operators of
 `Value` append instructions, so that the Python expression `(x - n * a) * b` writes the

@@ -47,10 +47,10 @@ class CarWithTrailers(AbstractNonholonomicExample):
     `steer_inertia` J of the front wheels about the vertical [kg m²]. For the trailers:
     `trailer_length` d from hitch to axle, `trailer_hitch` h, the distance of the hitch
     behind the axle of the vehicle in front, `trailer_centre` of mass ahead of the axle
-    [m], `trailer_mass` [kg] and `trailer_inertia` about the centre [kg m²]. Each of
-    them is one number for all trailers, or an array of n numbers. The default values do
-    not describe a particular car. The default `v0` is consistent at `q0`, with a speed
-    of 5 m/s.
+    [m], `trailer_mass` [kg] and `trailer_inertia` about the centre [kg m²]. Each
+    parameter of the trailers is one number for all, or an array of n numbers. The
+    default values do not describe a particular car. The default `v0` is consistent at
+    `q0`, with a speed of 5 m/s.
 
     **Source:** Laumond, *Controllability of a multibody mobile robot* (1993), and
     Rouchon, Fliess, Lévine and Martin, *Flatness and motion planning: the car with n

@@ -24,10 +24,10 @@ class ChaplyginTop(AbstractRollingBody):
 
     with q = (R, x): the attitude quaternion and the position of the centre of mass
     [m]; (v, ω) are their body velocities along the principal axes [m/s, 1/s]. If the
-    third axis is upward, the centre of mass is below the centre of the sphere by a. The
-    contact is s, seen from the centre of mass; Φ is its height, and φ the horizontal
-    velocity there. The multipliers are the components, along the axes of space, of the
-    force that the plane exerts on the sphere [N].
+    third axis points upward, the centre of mass is at the distance a below the centre
+    of the sphere. The contact is s, seen from the centre of mass; Φ is its height, and
+    φ the horizontal velocity there. The multipliers are the components, along the axes
+    of space, of the force that the plane exerts on the sphere [N].
 
     If I₁ = I₂, the body is Routh's sphere, which is integrable. Besides the energy, two
     quantities are then conserved: Jellett's integral K·s, with the angular momentum K
@@ -101,7 +101,7 @@ class ChaplyginTop(AbstractRollingBody):
         return {"energy": self.energy(t, q, v)}
 
     def integrals_of_routh(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Compute Jellett's and Routh's integral, conserved where I₁ = I₂."""
+        """Compute Jellett's and Routh's integral, conserved if I₁ = I₂."""
         s, moments = self._contact(q), self.moments.astype(v.dtype)
         weighted = moments[0] * moments[2] + self.mass * (moments @ s**2)
         return self.contact_momentum(q, v) @ s, v[5] * jnp.sqrt(weighted)

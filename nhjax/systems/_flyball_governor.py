@@ -112,8 +112,8 @@ class FlyballGovernor(AbstractExample):
     ) -> "FlyballGovernor":
         """Create a governor with both rods at `angle` and a shaft that turns at `rate`.
 
-        The slider is below the middles of the rods, where both couplers have the length
-        d. `parameters` are the parameters of the class.
+        The slider is below the middles of the rods, at the height at which both
+        couplers have the length d. `parameters` are the parameters of the class.
         """
         governor = cls(**parameters)
         dtype = governor.q0.dtype
@@ -188,7 +188,7 @@ class FlyballGovernor(AbstractExample):
         return conserved | {"energy": self.energy(t, q, v)}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute hinges, middles of rods, balls and joints of the slider in space."""
+        """Compute the positions of hinges, rod middles, balls and slider joints."""
         hinges, rods = self._rods(q)
         lifted = hinges.at[:, 2].set(q[3])
         places = {
@@ -204,7 +204,7 @@ class FlyballGovernor(AbstractExample):
         }
 
     def _rods(self, q: Array) -> tuple[Float[Array, "2 3"], Float[Array, "2 3"]]:
-        """Compute the hinges p_k, and the unit vectors u_k from hinges along rods."""
+        """Compute the hinges p_k, and the unit vectors u_k along the rods."""
         outward = jnp.stack([jnp.cos(q[0]), jnp.sin(q[0])])
         radial = jnp.stack([outward, -outward])
         cos, sin = jnp.cos(q[1:3])[:, None], jnp.sin(q[1:3])[:, None]
@@ -213,7 +213,7 @@ class FlyballGovernor(AbstractExample):
         return hinges, jnp.concatenate([cos * radial, -sin], axis=1)
 
     def _square_distances(self, q: Array) -> Float[Array, " 2"]:
-        """Compute d_k², from the middles of the rods to the slider."""
+        """Compute d_k², the squared distances from rod middles to the slider."""
         half = 0.5 * self.rod_length
         fall = self.height - q[3] - half * jnp.sin(q[1:3])
         return (half * jnp.cos(q[1:3])) ** 2 + fall**2

@@ -69,7 +69,7 @@ class FourBar(AbstractExample):
 
     @classmethod
     def turning(cls, angle: ArrayLike, rate: ArrayLike, **parameters: Any) -> "FourBar":
-        """Create a linkage with the crank at `angle`, which turns at `rate`.
+        """Create a linkage whose crank is at `angle` and turns at `rate`.
 
         The coupler is on the left of the line from the crank's end to (l₄, 0).
         `parameters` are the parameters of the class.
@@ -96,7 +96,7 @@ class FourBar(AbstractExample):
 
     @classmethod
     def parallelogram(cls) -> "FourBar":
-        """Create the benchmark with one loop, whose bars have 1 m and 1 kg.
+        """Create the benchmark: one loop of bars that have 1 m and 1 kg each.
 
         At the start the crank is upright, and its end moves to the right at 1 m/s. When
         all bars are horizontal, first after 0.71 s, the constraints are dependent, and

@@ -84,7 +84,7 @@ def about_z(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
 
 
 def about_axis(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """Compute the rotation about a unit vector; the identity exactly at angle 0."""
+    """Compute the rotation about a unit vector; exactly the identity for angle 0."""
     x, y, z = axis
     zero = jnp.zeros_like(x)
     skew = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)

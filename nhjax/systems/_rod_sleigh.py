@@ -32,10 +32,9 @@ class RodSleigh(AbstractNonholonomicExample):
     β + π/2. For β = 0 the system is the `ChaplyginSleigh`. For other angles n is not
     orthogonal to the rod, so that the reactions of the two constraints are coupled.
 
-    A blade with the same direction at another point of the line through the contact
-    along n permits the same velocities of the body. Therefore the body moves like a
-    `ChaplyginSleigh` whose blade is at the foot of the perpendicular from the centre of
-    mass to this line.
+    If the blade is shifted along n, the body can still have the same velocities.
+    Therefore the body moves like a `ChaplyginSleigh` whose blade is at the foot of the
+    perpendicular from the centre of mass to the line through the contact along n.
 
     **Parameters:** `mass1` m₁ and `mass2` m₂ [kg], `length` l [m], `angle` β [rad].
 

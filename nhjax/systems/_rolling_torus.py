@@ -19,7 +19,7 @@ from ._rolling_body import AbstractRollingBody
 
 
 class RollingTorus(AbstractRollingBody):
-    """A torus that rolls and tilts on a plane, such as a wheel, a hoop or a disc.
+    """A torus (a wheel, a hoop or a disc) that rolls and tilts on a plane.
 
     ℓ = m/2 |v|² + ½ (I (ω₁² + ω₂²) + J ω₃²) - m g z,  Φ = z + e₃·(R s),
     φ = (R (v + ω × s))₁₂,  s = -r γ - a (γ₁, γ₂, 0)/√(γ₁² + γ₂²),  γ = Rᵀ e₃,

@@ -72,7 +72,7 @@ class SliderCrank(AbstractExample):
     def turning(
         cls, angle: ArrayLike, rate: ArrayLike, **parameters: Any
     ) -> "SliderCrank":
-        """Create a mechanism with the crank at `angle`, which turns at `rate`.
+        """Create a mechanism whose crank is at `angle` and turns at `rate`.
 
         The slider is at a larger x than the pin of the crank. `parameters` are the
         parameters of the class.

@@ -35,10 +35,10 @@ class Snakeboard(AbstractGaitMachine):
 
     A `gait` prescribes the joints by the constraints Γ = (ψ, φ_b, φ_f) - gait(t). With
     `gait=None` the joints move freely under the torques (τ_ψ, τ_b, τ_f) [N m] in
-    `args`, of shape (3,) or `None`. In the default gait the rotor oscillates at the
-    frequency of the steering, and this gait drives the board from rest along its axis.
-    With other ratios of the frequencies, the board turns in place or moves sideways
-    (parking gait).
+    `args`, of shape (3,) or `None`. In the default gait, the rotor and the steering
+    oscillate at the same frequency. This gait drives the board from rest along its
+    axis. With other ratios of the frequencies, the board turns in place or moves
+    sideways (parking gait).
 
     **Parameters:** `mass` m [kg]; `inertia` J of the board, `rotor_inertia` J_r and
     `axle_inertia` J_w about the vertical [kg m²]; `half_length` l [m]; `gait`, a
@@ -91,7 +91,7 @@ class Snakeboard(AbstractGaitMachine):
         joint_rates: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0),
         **parameters: Any,
     ) -> "Snakeboard":
-        """Create a board at the origin whose centre moves ahead at `speed`, θ = 0.
+        """Create a board at the origin with θ = 0, whose centre moves ahead at `speed`.
 
         The sideways velocity and the turning rate follow from the constraints.
         `parameters` are the parameters of the class; without a `gait` among them the

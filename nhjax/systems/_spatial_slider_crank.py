@@ -90,7 +90,7 @@ class SpatialSliderCrank(AbstractExample):
     def turning(
         cls, angle: ArrayLike, rate: ArrayLike, **parameters: Any
     ) -> "SpatialSliderCrank":
-        """Create a mechanism with the crank at `angle`, which turns at `rate`.
+        """Create a mechanism whose crank is at `angle` and turns at `rate`.
 
         The slider is at x > 0. `parameters` are the parameters of the class.
         """

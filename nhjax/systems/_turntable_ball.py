@@ -38,7 +38,7 @@ class TurntableBall(AbstractConstrainedGroupExample):
     - `frame="space"` (the default) selects the spatial angular velocity Rω, as for a
         physical ball.
     - `frame="body"` selects ω itself along the principal axes ξ, η, ζ, as in the
-        printed constraints of the paper. For a homogeneous ball, a = b = c, the motion
+        constraints that the paper prints. For a homogeneous ball, a = b = c, the motion
         of (x, y) and of (ω_ξ, ω_η, ω_ζ) is the same as with `frame="space"`. For
         unequal moments, the system is not the physical ball.
 
@@ -177,8 +177,8 @@ class TurntableBall(AbstractConstrainedGroupExample):
     ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
         """Compute (q, v, λ) at `t`, for consistent data and a = b = c.
 
-        The attitude solves a linear differential equation with the known angular
-        velocity, to round-off. All other values have closed formulas.
+        The attitude satisfies a linear differential equation, which is solved to
+        round-off. All other values have closed formulas.
         """
         (quaternion, (x0, y0)), v0 = self._consistent_data()
         a, b, c = np.asarray(self.moments, dtype=np.float64)

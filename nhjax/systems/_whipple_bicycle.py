@@ -60,12 +60,12 @@ class WhippleBicycle(AbstractNonholonomicExample):
     component on the front wheel.
 
     `WhippleBicycle.running(speed, lean=, lean_rate=, steer=, steer_rate=)` creates a
-    bicycle that rolls; all these arguments are zero by default, except the speed of
+    bicycle that rolls. These arguments are zero by default, except `speed`, which is
     4.6 m/s. `steering` gives the torque on the steer axis: `SteerTorque()` reads the
     torque from `args`, and `LeanToSteer(lean_gain=0.0, lean_rate_gain=20.0)` is a rider
     who steers into the fall. You may also pass your own function of (t, q, v, args).
     With None, the default, the bicycle is uncontrolled, and its energy is conserved. If
-    the torque depends on `args`, pass them also to `initial_state(args=...)`.
+    the torque depends on `args`, also pass them to `initial_state(args=...)`.
 
     The model has no stop for the handlebar. When the bicycle falls, its velocities
     therefore grow without bound, until no step size is small enough. End the run with
@@ -267,7 +267,7 @@ def _bodies(bicycle: WhippleBicycle, q: Array) -> list[_Body]:
 
 
 def _wheels(bicycle: WhippleBicycle, q: Array) -> tuple[_Wheel, _Wheel]:
-    """Return the rear and the front wheel in the upright bicycle."""
+    """Return the rear and the front wheel of the upright bicycle."""
     rear, front = bicycle.rear_radius, bicycle.front_radius
     hub = _in_plane(q, jnp.zeros_like(rear), -rear)
     return _Wheel(hub, rear), _Wheel(_in_plane(q, bicycle.wheelbase, -front), front)

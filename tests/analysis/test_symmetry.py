@@ -119,7 +119,7 @@ def test_linear_stability_of_circling_wheels_agrees_with_newton_euler(body):
     stability = nhjax.linear_stability(
         moved.system, 0.0, moved.initial_state(), symmetry=moved.symmetry
     )
-    # Double zeros of the differences are a root of their round-off.
+    # Round-off of the differences moves a double zero by the square root of it.
     expected = np.linalg.eigvals(np.stack(columns, axis=1))
     expected[np.abs(expected) < 1e-4] = 0
     assert np.sum(expected == 0) == 2

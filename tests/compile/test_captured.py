@@ -1,4 +1,4 @@
-"""What a function reads beside its arguments is never stale, and costs no retrace."""
+"""Values read besides the arguments are never stale, and cost no retrace."""
 
 import types
 from functools import partial
@@ -53,7 +53,7 @@ def reads_module(t, q, v, args):
 
 
 class Planet:
-    """A plain object with a method, an attribute and one of its class."""
+    """A plain object with a method, an attribute and a class attribute."""
 
     share = 1.0
 
@@ -242,7 +242,7 @@ def unchanged():
 def test_tracked_jit_after_changed_value_traces_once(reader):
     lagrangian, change = reader()
     np.testing.assert_allclose(end(lagrangian)[0], -0.5, rtol=1e-13)
-    # That of `initial_state` looks at the shapes at every call.
+    # Every call of `initial_state` also traces the function to check its shapes.
     checks = len(traces)
     nhjax.initial_state(nhjax.LagrangianSystem(lagrangian), jnp.zeros(2), jnp.zeros(2))
     checks = len(traces) - checks

@@ -1,4 +1,4 @@
-"""What functions close over under transformations, and what is not tracked."""
+"""Values that functions close over under transformations, and untracked values."""
 
 from collections import deque
 from typing import Any
@@ -33,7 +33,7 @@ class Scaled(eqx.Module):
 
 
 class Label:
-    """A key that equals all others, with a value of its own."""
+    """A key that equals all other keys but has its own value."""
 
     def __init__(self, value):
         self.value = value

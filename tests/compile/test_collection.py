@@ -1,4 +1,4 @@
-"""Garbage is collected rarely inside of a block, and as before after it."""
+"""Garbage is collected rarely inside a block, and as usual after it."""
 
 import gc
 import threading

@@ -1,4 +1,4 @@
-"""Programs lose what is repeated and what nothing uses, and compute the same."""
+"""Programs lose repeated and unused operations, and compute the same."""
 
 import jax
 import jax.extend

@@ -1,4 +1,4 @@
-"""`jax.disable_jit`, with which people debug, shows numbers and changes none."""
+"""`jax.disable_jit`, which people use to debug, shows numbers without changing them."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Ensembles of programs give what their members give, and so do their derivatives."""
+"""Ensembles of programs, and their derivatives, equal those of single members."""
 
 import re
 
@@ -81,7 +81,7 @@ def test_ensemble_call_of_kernel_has_gradients_of_its_members(axes, transform):
 
 
 def batched(shape, inner, outer, dtype):
-    """Make numbers of this shape, with axes for the members where these are given."""
+    """Make numbers of this shape, with an axis for each given number of members."""
     shape = list(shape)
     for axis, size in ((inner, 4), (outer, 3)):
         if axis is not None:

@@ -1,4 +1,4 @@
-"""Programs in one kernel give what they give elsewhere, and so do their derivatives."""
+"""Programs in one kernel, and their derivatives, give the same results as elsewhere."""
 
 import equinox as eqx
 import jax

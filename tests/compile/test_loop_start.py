@@ -11,7 +11,7 @@ from nhjax._compile import as_cpu_kernel, started_like
 from nhjax.lanes import llvm_ir
 
 
-# Two programs agree bit for bit only in kernels as users have them.
+# Two programs agree bit for bit only in optimised kernels, as users have them.
 pytestmark = pytest.mark.usefixtures("optimised_kernels")
 
 

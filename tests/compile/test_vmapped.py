@@ -30,7 +30,7 @@ def form(request, monkeypatch):
 
 
 def one(p, t, x):
-    """A tree of results of one row; `p` is a value of the surroundings."""
+    """A tree of results of one row; `p` is the same for all rows."""
     scale = jnp.sin(p) * jnp.exp(-t)
     rotated = jnp.sum(scale[:, None] * (x * jnp.cos(x))[None], axis=1)
     return {"vector": rotated, "number": jnp.sum(rotated) + t, "sign": x[0] > 0}

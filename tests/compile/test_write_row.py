@@ -20,7 +20,7 @@ def loop_of(write):
         def advance(k, carry):
             x, buffer = carry
             x = jnp.sin(x) + 0.1 * x[::-1]
-            # The last row takes what is not kept.
+            # The last row receives the states that are not kept.
             slot = jnp.where(k % 3 == 2, ROWS, (5 * k) % ROWS)
             return x, write(buffer, x, slot)
 

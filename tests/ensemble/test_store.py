@@ -135,7 +135,7 @@ class Killed(BaseException):
 def test_ensemble_store_interrupted_at_any_operation_resumes(
     tmp_path, whole, monkeypatch
 ):
-    """Each run ends at another file operation, without the last bytes."""
+    """Each run ends at another file operation, which loses its last bytes."""
     fsync, replace, folder = os.fsync, os.replace, tmp_path / "store"
     left, ran = [0], []
 
@@ -311,7 +311,7 @@ def test_ensemble_store_in_unusable_folder_raises(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", ["lock", "chunks-1.jsonl"])
 def test_ensemble_store_locked_by_another_process_raises(name, store, whole):
-    """The lock is that of the store, or that of a process which still runs."""
+    """The lock belongs to the store, or to a process that still runs."""
     fcntl = pytest.importorskip("fcntl")
     with open(store / "manifest" / name, "w") as locked:
         fcntl.flock(locked, fcntl.LOCK_EX)

@@ -1,7 +1,7 @@
-"""Components that a projection keeps have their bits; the others are the nearest.
+"""A projection keeps components bit for bit; the others are the nearest.
 
-Mass matrices, Jacobians and the conditions for the nearest are written in NumPy here,
-and SciPy's SLSQP finds the nearest by another method.
+Mass matrices, Jacobians and the conditions for the nearest state are written in NumPy
+here, and SciPy's SLSQP finds this state by another method.
 """
 
 import equinox as eqx
@@ -40,7 +40,7 @@ def assert_kept(found, given, kept):
 
 
 def nearest_linear(metric, rows, right, u, kept):
-    """Solve the conditions for the nearest w with rows w = right and w = u there."""
+    """Return the w nearest to u with rows w = right, and w = u at `kept`."""
     n = len(u)
     free = [i for i in range(n) if i not in {i % n for i in kept}]
     inner, across = metric[np.ix_(free, free)], rows[:, free]
@@ -53,7 +53,7 @@ def nearest_linear(metric, rows, right, u, kept):
 
 
 def assert_stationary(metric, rows, change, kept, tolerance=1e-12):
-    """The gradient of the distance is a combination of the rows and of the kept."""
+    """The gradient of the distance is a combination of rows and kept directions."""
     units = np.eye(len(change))[list(kept)]
     normals = np.concatenate([rows, units]).T
     gradient = metric @ change
@@ -107,8 +107,8 @@ def test_projection_with_kept_velocities_keeps_bits_and_is_nearest(kept):
 @pytest.mark.parametrize("given", ["v", "p"])
 @pytest.mark.parametrize("system", [LAGRANGIAN, HAMILTONIAN], ids=["L", "H"])
 def test_projection_keeps_velocities_and_momenta_in_both_forms(system, given):
-    # Of a Lagrangian the distance is that of velocities, of a Hamiltonian of momenta:
-    # they are the same number.
+    # The distance is measured in velocities for a Lagrangian and in momenta for a
+    # Hamiltonian: both are the same number.
     u, kept = V if given == "v" else MASS @ V, (1, 3)
     y = nhjax.initial_state(
         system,
@@ -281,7 +281,7 @@ PLANE = np.diag([2.0, 2.0, 0.5])
 
 
 def plane_body(retraction):
-    """A rod in the plane, one point of which stays on a line that is at an angle."""
+    """A rod in the plane, one point of which stays on an inclined line."""
     return nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ jnp.asarray(PLANE) @ v,
         holonomic=lambda t, q, args: q[1] + jnp.sin(q[2]) - 0.3 * q[0] - 0.5,
@@ -377,7 +377,7 @@ def test_kept_quaternion_not_of_unit_length_is_refused():
 
 
 def test_kept_number_of_quaternion_out_of_reach_is_refused():
-    # At the identity no rotation leaves the real part as it is, to first order.
+    # At the identity, every rotation changes the real part, but not to first order.
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v,
         holonomic=lambda t, q, args: q[1] - 0.1,
@@ -449,7 +449,7 @@ def test_projection_with_tiny_coefficient_of_free_component_is_refused():
 
 @pytest.mark.parametrize("unit", [1e-12, 1e-6, 1.0, 1e6, 1e12])
 def test_projection_with_kept_components_does_not_depend_on_units(unit):
-    # Lengths in units of their own: masses and rows of two coordinates change.
+    # Two coordinates in other units: their masses and rows change.
     scale = np.array([unit, 1.0, unit, 1.0, 1.0, 1.0])
     metric, rows = MASS * scale[:, None] * scale, ROWS * scale
     system = nhjax.LagrangianSystem(
@@ -477,7 +477,7 @@ def test_projection_keeps_velocities_of_any_size(size):
 
 
 def test_projection_with_kept_components_accepts_round_off_near_zero():
-    # 0.1 + 0.2 - 0.3 is round-off, which the same floor allows as without `keep_q`.
+    # 0.1 + 0.2 - 0.3 is round-off; the same floor allows it as without `keep_q`.
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * (v @ v),
         holonomic=lambda t, q, args: q[0] - q[1] + (0.1 + 0.2 - 0.3),
@@ -630,7 +630,7 @@ def test_kept_velocities_that_violate_constraint_are_named(v, kept, message, rel
         start(v)
     with pytest.raises(RuntimeError, match=f"ConstraintViolationError: .*{message}"):
         jax.block_until_ready(jax.jit(start)(v))
-    # What the message says to leave out is enough.
+    # It is enough to leave out what the message names.
     places = {"x": 0, "y": 1, "z": 2, "s": 3}
     for names in released:
         rest = {places.get(x, x) for x in kept} - {places[x] for x in names}

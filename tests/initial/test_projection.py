@@ -1,4 +1,4 @@
-"""States near the constraints are projected onto them, whatever they are off by."""
+"""States near the constraints are projected onto them, however large the violation."""
 
 import jax
 import jax.numpy as jnp
@@ -187,7 +187,7 @@ def test_projection_from_zero_gradient_of_constraint_is_refused():
 
 
 def test_initial_state_with_cancelling_terms_at_origin_is_accepted():
-    # 0.1 + 0.2 - 0.3 is one unit of round-off, and nothing tells the size of q.
+    # 0.1 + 0.2 - 0.3 is one unit of round-off, and nothing shows the scale of q.
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * (v @ v),
         holonomic=lambda t, q, args: q[0] - q[1] + (0.1 + 0.2 - 0.3),

@@ -217,7 +217,7 @@ def test_hessian_by_each_adjoint_matches_finite_differences(adjoint, order):
     np.testing.assert_allclose(hessian @ along, expected, rtol=1e-8)
 
 
-# What cannot be -----------------------------------------------------------------------
+# What is refused ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("adjoint", [nhjax.DirectAdjoint, 3])
@@ -261,7 +261,7 @@ def test_memory_of_each_adjoint_grows_as_documented():
         assert memory is not None
         return memory.temp_size_in_bytes
 
-    # A part of each does not grow at all.
+    # Each memory has a part that does not grow.
     assert temporary(REVERSIBLE, 10_000) == temporary(REVERSIBLE, 100)
     assert temporary(CHECKPOINTS, 10_000) <= 10 * temporary(CHECKPOINTS, 100)
     assert 50 * temporary(DIRECT, 100) < temporary(DIRECT, 10_000)

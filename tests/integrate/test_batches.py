@@ -87,7 +87,7 @@ def test_ensemble_of_runs_equals_single_runs():
 
 
 def test_solution_returned_from_jit_is_unchanged():
-    # Functions are no leaves that a jitted function may return.
+    # A jitted function cannot return functions as leaves.
     sol = jax.jit(lambda dt: run(dt=dt, saveat=SaveAt(dense=True)))(DT)
     again = eqx.filter_jit(lambda sol, t: sol.evaluate(t))(sol, 0.55)
     assert_trees_close(again, sol.evaluate(0.55), rtol=1e-15)

@@ -1,7 +1,7 @@
 """Observed orders of convergence, against exact solutions and against SciPy.
 
 A run of N steps of size T/N is compared with the reference at each of its nodes, and
-the slope is that of the root mean square of these errors from one N to the next. The
+slopes are taken from the root mean square of these errors from one N to the next. The
 mean over nodes matters for multipliers: a single node may lie where the error passes
 through zero, and for even s the parasitic part of a propagated multiplier alternates.
 The steps are as large as the asymptotic regime allows (1/2 to 1/8 at s >= 5), which
@@ -53,9 +53,9 @@ COUNTS = {
     6: (4, 6, 8, 12, 24),
 }
 STATE_COUNTS = COUNTS | {6: (4, 6, 8)}  # Beyond these the state is at round-off.
-# The error of a propagated multiplier is larger by a power h^(2-s) or more, and its
-# slope sets in later: between h = 1/2 and 1/4 it is 4.3 at s = 5 on the particle, and
-# 4.7 on the particle and 7.8 on the sleigh at s = 6.
+# The error of a propagated multiplier is larger by a factor h^(2-s) or more, and it
+# reaches its slope only at smaller h: between h = 1/2 and 1/4 the slope is 4.3 at s = 5
+# on the particle, and 4.7 on the particle and 7.8 on the sleigh at s = 6.
 MULTIPLIER_COUNTS = COUNTS | {5: (8, 16), 6: (12, 24)}
 
 
@@ -87,8 +87,8 @@ def solved_errors(part, stages, closure):
 
 every_part = pytest.mark.parametrize("part", PARTS)
 every_stages = pytest.mark.parametrize("stages", exhaustive_but((2, 3, 4), COUNTS))
-# Four stages are an even number as two are: in the quick suite the closure that depends
-# on the parity is enough for them.
+# Four stages behave like two, as their number is even: the quick suite tests them only
+# with the closure that depends on the parity.
 every_method = pytest.mark.parametrize(
     ("stages", "closure"),
     exhaustive_but(
@@ -96,7 +96,7 @@ every_method = pytest.mark.parametrize(
         product(COUNTS, helpers.CLOSURES),
     ),
 )
-# Of the multiplier nothing is asked here: each number of stages and each closure once.
+# For tests without multipliers: each number of stages and each closure occurs once.
 some_methods = pytest.mark.parametrize(
     ("stages", "closure"), [(2, "symmetric"), (3, "propagated"), (4, "consistent")]
 )
@@ -173,7 +173,7 @@ def assert_order_against_scipy(
 
 
 def pendulum_lagrangian(t, q, v, args):
-    """An oscillator beside a pendulum."""
+    """An oscillator and a pendulum, uncoupled."""
     return 0.5 * (v @ v) - 0.5 * q[0] ** 2 + jnp.cos(q[1])
 
 
@@ -195,8 +195,8 @@ def pendulum_problem(friction):
     return y0, acceleration, args
 
 
-# The cubic friction makes the time scale shorter at the start: order 8 without it is
-# at round-off where order 8 with it is asymptotic.
+# The cubic friction shortens the time scale at the start: at step sizes where order 8
+# is asymptotic with friction, it is at round-off without friction.
 PENDULUM_COUNTS = {
     0.0: {2: (32, 64, 128), 4: (8, 16, 32), 6: (12, 16, 24), 8: (6, 8, 12)},
     0.3: {2: (32, 64, 128), 4: (8, 16, 32), 6: (12, 16, 24), 8: (12, 16)},

@@ -15,8 +15,8 @@ from support.long import long
 
 PARTICLE = NonholonomicParticle()
 T = 1.0
-# T lies in the step after these, at a general point of it: in the middle some of the
-# polynomials are better than elsewhere.
+# T lies in the step after these, at a general point of it: in the middle, some of the
+# polynomials are more accurate.
 STEPS_BEFORE, FRACTION = np.array([8, 11, 16, 23]), 0.3
 STEP_SIZES = T / (STEPS_BEFORE + FRACTION)
 
@@ -50,7 +50,7 @@ def order(error):
     return np.polyfit(np.log(STEP_SIZES), np.log(error), 1)[0]
 
 
-# Two stages are the exception; of others, an odd and an even number.
+# Two stages are an exception; three and four stand for odd and even numbers.
 @pytest.mark.parametrize("stages", [2, 3, 4])
 def test_dense_output_without_velocity_forces_has_expected_orders(stages):
     q, v, multiplier = PARTICLE.exact(T)
@@ -58,7 +58,7 @@ def test_dense_output_without_velocity_forces_has_expected_orders(stages):
     expected = {"q": q, "v": v, "p": v, "multiplier": multiplier}
     error = errors(problem, stages, "symmetric", expected)
     assert abs(order(error["q"]) - stages) < 0.25
-    # One more than in general; for two stages the nodes have no more than 2.
+    # One order more than in general; with two stages, even the nodes have only 2.
     better = min(stages + 1, 2 * stages - 2)
     assert better - 0.25 < order(error["p"]) < better + 0.5
     assert better - 0.25 < order(error["v"]) < better + 0.5
@@ -79,7 +79,7 @@ def test_dense_output_with_velocity_forces_has_expected_orders(stages):
 
 @pytest.mark.parametrize(("stages", "expected"), [(3, 2), (4, 4)])
 def test_dense_output_of_propagated_multiplier_has_expected_orders(stages, expected):
-    # s for even s, s - 1 for odd s, as at the nodes.
+    # The order is s for even s and s - 1 for odd s, as at the nodes.
     _, _, multiplier = PARTICLE.exact(T)
     problem = PARTICLE.system, PARTICLE.initial_state(), None
     error = errors(problem, stages, "propagated", {"multiplier": multiplier})
@@ -139,7 +139,7 @@ def test_dense_output_between_nodes_is_a_consistent_state(sol):
         nhjax.continuous_multiplier(PARTICLE.system, t, state),
         rtol=1e-13,
     )
-    # The constraint is imposed at the nodes alone.
+    # The constraint is imposed only at the nodes.
     violation = jnp.abs(PARTICLE.system.constraint_violation(t, state))[0]
     assert 1e-12 < violation < 1e-5
 

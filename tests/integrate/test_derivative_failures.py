@@ -23,7 +23,7 @@ INCONSISTENT = nhjax.RESULTS.inconsistent_start
 
 
 def assert_lanes(loss, lanes, others, reasons):
-    """Of `lanes` some fail, for the `reasons`; in `others` these are replaced.
+    """Some of `lanes` fail, for the `reasons`; `others` has good ones in their place.
 
     `loss(x)` returns a number and the solution behind it.
     """
@@ -46,14 +46,14 @@ def assert_lanes(loss, lanes, others, reasons):
     assert np.all(np.any(expected.reshape(len(reasons), -1) != 0, axis=1))
     failed = failed.reshape(-1, *[1] * (expected.ndim - 1))
     np.testing.assert_array_equal(got, np.where(failed, np.nan, expected))
-    # A loss of a state that is no number has no derivative, left out or not.
+    # A loss of a NaN state has no derivative, even if it is left out.
     finite = np.all(np.isfinite(lanes.reshape(len(reasons), -1)), axis=1)
     left_out = np.where(failed, 0.0, expected)
     np.testing.assert_array_equal(got_masked[finite], left_out[finite])
 
 
 def lossy_lagrangian(t, q, v, args):
-    """A mass that changes and a wall at which there is no number."""
+    """A mass that changes and a wall, beyond which values are NaN."""
     mass = args["mass"] + args["change"] * t
     wall = 1e-3 * jnp.sqrt(args["wall"] - q[0])
     return 0.5 * mass * (v @ v) - 0.5 * (q @ q) + wall
@@ -125,7 +125,7 @@ def test_gradient_of_a_member_that_leaves_the_chart_is_nan_for_it_only(name):
 
 
 def give_up(dt, adjoint):
-    """A run that fails at once, though it need not."""
+    """A run that fails at once, because it may take only two iterations."""
     particle = systems.NonholonomicParticle()
     return jnp.sum(
         nhjax.integrate(

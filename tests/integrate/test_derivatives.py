@@ -36,7 +36,7 @@ GIVEN = {
 def driven(given, closure, saveat):
     """A run that depends on all arguments and on arrays in closures."""
     scale, args = given["fn"], given["args"]
-    # The masses are leaves of the system; over all else the functions close.
+    # The masses are leaves of the system; the functions close over all the rest.
     leaves = Driven(given["leaf"], given["closed over"])
     beta = given["closed over"]
 
@@ -190,7 +190,7 @@ def test_gradient_of_projected_initial_state_matches_finite_differences(example)
 
 
 def test_gradient_of_state_from_explicit_parts_matches_finite_differences():
-    # y0 by its parts, as they come from an earlier solution.
+    # The parts of y0 vary independently, as if from an earlier solution.
     system, y0, args = helpers.problem("driven")
     method = LobattoIIIAB(2, "propagated")
 
@@ -199,7 +199,7 @@ def test_gradient_of_state_from_explicit_parts_matches_finite_differences():
             nhjax.integrate(system, method, y0, dt=0.05, num_steps=STEPS, args=args).ys
         )
 
-    # More than this off the constraints the start is refused.
+    # A start that violates the constraints by more than this is refused.
     assert_gradient(loss, y0, epsilon=3e-5)
 
 
@@ -241,7 +241,7 @@ def test_second_derivative_by_step_size_in_a_loop_of_runs_equals_two_forward_one
             y = jax.lax.fori_loop(0, 2, lambda _, y: run(y), y0)
         return jnp.sum(y.q**2)
 
-    # The checks of a run raise by a call-back, which has no derivative.
+    # The checks of a run raise through a callback, which has no derivative.
     found = jax.hessian(after)(0.1)
     np.testing.assert_allclose(found, jax.jacfwd(jax.jacfwd(after))(0.1), rtol=1e-12)
     assert abs(found) > 1e-3

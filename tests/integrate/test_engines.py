@@ -40,14 +40,14 @@ LONG = (
     "WhippleBicycle",
 )
 PARTICLE = systems.NonholonomicParticle()
-# Iterations end in round-off: some steps have one more or one less.
+# Iterations end at round-off, so some steps take one more or one less.
 LARGEST_DIFFERENCE_OF_COUNTS, OF_A_MEMBER = 0.03, 0.15
 
 
 def ensemble(example, members, num_steps):
     """States and step sizes of members that end at times around t = 2.
 
-    The ball in the bowl turns so fast that such steps need have no solution.
+    The ball in the bowl turns so fast that such steps may have no solution.
     """
     y0 = example.initial_state()
     y0 = jax.tree.map(lambda x: np.broadcast_to(x, (members, *x.shape)), y0)
@@ -62,7 +62,7 @@ def by_both(function, args, monkeypatch):
     for engine in ("lanes", "xla"):
         monkeypatch.setenv("NHJAX_ENGINE", engine)
 
-        # A function of its own, as programs that have been compiled keep their engine.
+        # A new function each time, since compiled programs keep their engine.
         @jax.jit
         def run(leaves):
             return jax.extend.core.jaxpr_as_fun(program)(*leaves)
@@ -142,6 +142,6 @@ def test_ensemble_of_any_size_equals_its_members(members):
 
     dt = jnp.linspace(0.1, 0.2, members)
     q = run(dt)
-    # The lanes of a vector compute alike, wherever a member is.
+    # All lanes of a vector compute alike, so the place of a member does not matter.
     np.testing.assert_array_equal(q[::-1], run(dt[::-1]))
     np.testing.assert_array_equal(q[:1], run(dt[:1]))

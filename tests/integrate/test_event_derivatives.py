@@ -79,10 +79,9 @@ def test_event_derivatives_of_members_on_a_group_match_single_runs():
 
 @pytest.mark.long
 def test_event_second_derivatives_match_closed_forms():
-    """Of a ball that falls from the height 1/2 at the time g^(-1/2), and rises half.
+    """A ball falls from the height 1/2 until T = g^(-1/2), and keeps half its speed.
 
-    Half of its speed is left, so that its height at t = 1.5 is, with T = g^(-1/2),
-    g T/2 (1.5 - T) - g/2 (1.5 - T)².
+    So its height at t = 1.5 is g T/2 (1.5 - T) - g/2 (1.5 - T)².
     """
     ball = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v - args * q[0])
     event = Event(

@@ -13,7 +13,7 @@ from support.helpers import scalar
 
 
 METHOD = LobattoIIIAB(2)
-# In unit time it moves by its velocity, and it falls by half a unit from rest.
+# In unit time, FREE moves by its velocity, and BALL falls half a unit from rest.
 FREE = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v)
 BALL = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v - q[0])
 GO = nhjax.initial_state(FREE, jnp.zeros(1), jnp.ones(1))
@@ -116,7 +116,7 @@ def test_event_resets_within_one_step_all_fire(dt):
     times, _ = reported(sol)
     np.testing.assert_allclose(times, np.arange(1, 10, 2), rtol=1e-14)
     np.testing.assert_allclose(sol.events.after.v[:5], 1.0, rtol=1e-13)
-    # Steps that were tried and taken anew have not failed.
+    # Steps that were tried and then repeated have not failed.
     assert int(sol.stats["failed_step"]) == -1
     assert int(sol.stats["worst_coordinate"]) == -1
 

@@ -48,7 +48,7 @@ def test_exported_run_in_another_process_gives_equal_results(tmp_path, monkeypat
     names = map(str, (program, arguments, results))
     subprocess.run([sys.executable, "-c", OTHER_PROCESS, *names], check=True)
     found = list(np.load(results).values())
-    # Exported programs are compiled by XLA alone, by whatever engine is chosen.
+    # XLA alone compiles exported programs, whichever engine is chosen.
     monkeypatch.setenv("NHJAX_ENGINE", "xla")
     q, code = jax.jit(end_of_run)(*given)
     slopes = jax.jit(jax.grad(lambda *x: end_of_run(*x)[0].sum(), argnums=(0, 1, 2)))(

@@ -116,7 +116,7 @@ def test_failure_by_max_iterations_returns_its_result():
 
 
 def test_failure_message_names_coordinate_and_smaller_dt():
-    # Three oscillators that know nothing of each other, the second one very stiff.
+    # Three uncoupled oscillators, the second one very stiff.
     stiffness = jnp.asarray([1.0, 1e9, 2.0])
 
     def lagrangian(t, q, v, args):
@@ -143,7 +143,7 @@ def test_failure_message_names_coordinate_and_smaller_dt():
     message = r"to coordinate 1\. `dt` is 0\.25: if all forces are smooth, try 0\.125\."
     with pytest.raises(nhjax.IntegrationError, match=message):
         run_with(0.25)
-    # Each lane has a step of its own.
+    # Each lane has its own step size.
     with pytest.raises(Exception, match=f"member 1, step 0: .*{message}"):
         jax.vmap(run_with)(jnp.asarray([1e-6, 0.25]))
 

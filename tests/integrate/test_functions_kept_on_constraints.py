@@ -19,7 +19,7 @@ def particle_at(y: float) -> systems.NonholonomicParticle:
 
 
 def substituted_energy(t, q, v, args):
-    """The energy of the particle, with y v_x in the place of v_z."""
+    """The energy of the particle, with y v_x in place of v_z."""
     kinetic = v[0] ** 2 + v[1] ** 2 + (q[1] * v[0]) ** 2
     return 0.5 * kinetic + 0.5 * (q[0] ** 2 + q[1] ** 2)
 
@@ -179,7 +179,7 @@ def test_invariant_impulses_exclude_directions_of_reactions():
     system, y0 = PARTICLE.system, PARTICLE.initial_state()
 
     def passenger(t, q, v, args):
-        # As conserved as the energy, but not parallel to it.
+        # It is conserved like the energy, but its derivative has another direction.
         return 0.5 * (1 + q[1] ** 2) * v[0] ** 2 + 0.5 * q[0] ** 2
 
     options = {"num_steps": 10, "saveat": saveat, "invariants": passenger}
@@ -254,7 +254,7 @@ def test_invariant_gradients_on_constraints_match_finite_differences(name):
     y0 = particle_at(1.0).initial_state()
 
     def loss(x):
-        """Of the step size, of a factor of velocities and of the place."""
+        """The variables are the step size, a factor of velocities and the place."""
         q = y0.q + x[2]
         v = x[1] * y0.v
         v = jnp.stack([v[0], v[1], q[1] * v[0]])

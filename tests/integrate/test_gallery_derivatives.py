@@ -22,9 +22,9 @@ from support.long import exhaustive_but
 
 
 def assert_gradients_of_examples(examples, method, turning):
-    """Of each of them in its own parameters, state and a force on it; of all in dt.
+    """Differentiate each example in its own parameters, state and force, all in dt.
 
-    The force is gyroscopic, `turning` its size: it depends on velocities, and does no
+    The force is gyroscopic, of size `turning`: it depends on velocities and does no
     work.
     """
     given, joined = zip(*map(split, examples), strict=True)
@@ -50,7 +50,7 @@ def assert_gradients_of_examples(examples, method, turning):
         return jnp.sum(each), each
 
     dt, along = jnp.asarray(0.05), direction(given)
-    # Of the types of all that is moved, not weaker ones: one program serves them all.
+    # `moved` by 0 makes the types as strong as below, so that one program suffices.
     given = moved(given, along, 0.0)
     program = jax.jit(jax.value_and_grad(losses, argnums=(0, 1), has_aux=True))
     _, (gradients, in_dt) = program(given, dt)
@@ -115,7 +115,7 @@ QUICK = (
             ("ball", 2, "symmetric"),
             ("Suslov", 2, "consistent"),
             ("Veselova", 2, "symmetric"),
-            # Without nonholonomic constraints there is nothing to close.
+            # Without nonholonomic constraints no closure is needed.
             ("oscillator and pendulums", 2, "symmetric"),
             ("rigid body", 2, "symmetric"),
             ("heavy top", 2, "symmetric"),
@@ -127,7 +127,7 @@ def test_gradient_of_each_gallery_system_matches_finite_differences(
     name, stages, closure
 ):
     # The sleigh amplifies rounding errors of propagated multipliers; with a force of
-    # this sign its gradient is large beside them.
+    # this sign, its gradient is large compared with them.
     turning = -0.05 if name == "attracting and linear" else 0.05
     method = LobattoIIIAB(stages, closure)
     assert_gradients_of_examples(BESIDE[name], method, turning)

@@ -23,8 +23,8 @@ CONSTRAINED = [name for name in EVERYTHING if name != "oscillator"]
 def on_their_own(names, closures):
     """Pairs (name, closure) of systems that run on their own.
 
-    Those of QUICK run side by side, too, with each closure: on their own, the symmetric
-    one does for all but two of them.
+    Systems of QUICK also run side by side with each closure, so on their own the
+    symmetric closure is enough for all but two of them.
     """
     cases = [
         (name, closure)
@@ -42,7 +42,7 @@ symmetric_closures = pytest.mark.parametrize("closure", ["propagated", "symmetri
 
 
 def node(states, k):
-    # An index into an array of JAX would be a program of its own.
+    # An index into a JAX array would compile a separate program.
     return jax.tree.map(lambda x: np.asarray(x)[k], states)
 
 
@@ -53,9 +53,9 @@ def node(states, k):
 def violations(name, ts, ys):
     """Φ_a and |Φ_a| / (Σ_j |D2Φ_aj| max |v|) at every node.
 
-    The maximum of v, since its components come out of one linear system: Σ |D2Φ_j v_j|
-    itself is round-off where the sleigh passes θ = 0. Side by side, a constraint is
-    compared with the velocities of its own system.
+    The maximum of v is taken, since all its components come from one linear system:
+    Σ |D2Φ_j v_j| itself is round-off where the sleigh passes θ = 0. Side by side, a
+    constraint is compared with the velocities of its own system.
     """
     system, _, args = problem(name)
 
@@ -125,8 +125,8 @@ def there_and_back(name, stages, closure, steps):
 def assert_returns(name, stages, closure):
     for field, distance in there_and_back(name, stages, closure, 1).items():
         assert distance <= 1e-13, f"{field} after one step: {distance:.1e}"
-    # The stage equations know λ through h λ D2Φ beside p: its round-off is that of
-    # p / h, and the propagated one keeps all it has collected.
+    # The stage equations add h λ D2Φ to p, so λ has the round-off of p / h, and a
+    # propagated λ accumulates it.
     momentum = np.max(np.abs(problem(name)[1].p))
     for field, distance in there_and_back(
         name, stages, closure, helpers.RECORDED_STEPS

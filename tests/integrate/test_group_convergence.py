@@ -98,7 +98,7 @@ def assert_finest_order(order, errors, quantity):
     assert_order(order, counts[-2:], found[-2:])
 
 
-# The stages do not know of the retraction: an even and an odd number are enough.
+# The stages do not depend on the retraction: an even and an odd number are enough.
 @pytest.mark.parametrize(
     ("retraction", "stages"),
     exhaustive_but(
@@ -113,7 +113,7 @@ def test_state_on_a_group_converges_with_order_2s_minus_2(part, retraction, stag
         assert_finest_order(2 * stages - 2, errors, quantity)
 
 
-# The closures do not know of the retraction: one for each is enough.
+# Closures do not depend on the retraction, so one retraction is enough.
 @every_stages
 @pytest.mark.parametrize("part", range(2), ids=ON_GROUPS)
 def test_propagated_multiplier_on_a_group_converges_with_order_s_or_s_minus_1(
@@ -166,7 +166,7 @@ def test_free_rigid_body_on_a_group_converges_with_method_order(method, retracti
 def test_ball_on_a_product_of_groups_converges_with_order_2s_minus_2(stages):
     ball = systems.TurntableBall.rolling((0.3, -0.2), (0.5, 0.3))
     method = nhjax.LobattoIIIAB(stages)
-    # It turns by up to a radian in a step of the counts that suit the others.
+    # With the step counts of the others it would turn by up to a radian in a step.
     counts = {2: (32, 64), 4: (32, 64), 6: (32, 48)}[method.order]
     errors = errors_of(ball, method, counts)
     for quantity in ("q", "v"):

@@ -29,8 +29,8 @@ def axes(q):
 def pendulum(turning_inertia):
     """A pendulum of unit mass and length on the horizontal lift of its sphere.
 
-    Its point is the third body axis. Turns about it move nothing: they are forbidden,
-    and their inertia is arbitrary.
+    Its point is the third body axis. Turns about this axis do not move it: they are
+    forbidden, with arbitrary inertia.
     """
     return nhjax.LagrangianSystem(
         lambda t, q, v, args: (
@@ -49,7 +49,7 @@ def run(system, v, stages):
 
 
 def point_of_pendulum(ts, v):
-    """Its position and velocity by ẍ = -g e_z + λ x, with |x| = 1."""
+    """The point's position and velocity from ẍ = -g e_z + λ x, with |x| = 1."""
     start = axes(ATTITUDE[None])[0]
 
     def rate(_, z):

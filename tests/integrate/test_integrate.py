@@ -43,7 +43,7 @@ def test_run_with_explicit_time_continues_from_its_end():
     assert_trees_close(back, middle, rtol=1e-11, atol=1e-12)
     whole = nhjax.integrate(system, method, y0, dt=0.05, num_steps=2 * STEPS, args=args)
     assert_trees_close(end, jax.tree.map(lambda x: x[0], whole.ys), rtol=1e-13)
-    # It is the time that does it: the same state at another time is not consistent.
+    # The time matters: the same state at another time is not consistent.
     with pytest.raises(nhjax.IntegrationError, match="step 0"):
         part(middle, 0.0)
 
@@ -56,7 +56,7 @@ def test_run_in_two_parts_equals_one_run(closure):
     middle = jax.tree.map(lambda x: x[-1], half.ys)
     rest = run(method=method, num_steps=50, y0=middle, t0=half.t1)
     np.testing.assert_allclose(rest.t1, whole.t1, rtol=1e-15)
-    # The propagated multiplier carries its round-off along.
+    # The propagated multiplier accumulates its round-off.
     assert_trees_close(rest.ys, whole.ys, rtol=1e-12, atol=1e-13)
 
 
@@ -101,7 +101,7 @@ def test_stats_of_a_run_count_steps_and_iterations():
 
 
 def test_stats_of_a_run_include_the_initial_state():
-    # A start off the constraints, by less than what is refused.
+    # A start that violates the constraints, but not enough to be refused.
     y0 = PARTICLE.initial_state()
     y0 = eqx.tree_at(lambda y: y.q, y0, y0.q.at[1].add(1e-6))
     violation = jnp.abs(PARTICLE.system.constraint_violation(0.0, y0))[0]
@@ -210,7 +210,7 @@ def test_run_in_single_precision_keeps_its_dtype(closure):
     q, v, multiplier = PARTICLE.exact(DT * STEPS)
     np.testing.assert_allclose(sol.ys.q[0], q, atol=2e-6)
     np.testing.assert_allclose(sol.ys.v[0], v, atol=2e-6)
-    # The propagated multiplier has no better than the order 4 of its own.
+    # The propagated multiplier has only its own order, which is 4.
     np.testing.assert_allclose(sol.ys.multiplier[0], multiplier, atol=1e-4)
 
 
@@ -227,7 +227,7 @@ def test_dense_output_in_single_precision_keeps_its_dtype():
 
 
 def test_dense_output_in_single_precision_reaches_the_end_of_a_long_run():
-    # t1 is rounded to 1e-7 of itself, far more than a fixed part of a step.
+    # The round-off of t1 is 1e-7 times t1, far more than a fixed part of a step.
     oscillator = HarmonicOscillator()
     y0 = oscillator.initial_state(jnp.float32)
     sol = run(

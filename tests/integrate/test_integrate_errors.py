@@ -80,7 +80,7 @@ def test_integrate_with_state_of_another_system_raises(y0):
         run((Q, V))
 
 
-# A state that is well-formed, but no state of this system at this time.
+# A well-formed state, but not a state of this system at this time.
 INCONSISTENT = {
     "v by hand": lambda y0: changed(y0, v=y0.v + jnp.array([0.0, 0.1, 0.0])),
     "p by hand": lambda y0: changed(y0, p=1.01 * y0.p),
@@ -96,7 +96,7 @@ def test_integrate_with_inconsistent_state_raises(change, y0):
 
 
 def test_integrate_with_slightly_perturbed_state_runs(y0):
-    # Differences for a derivative take the states off the constraint.
+    # Finite differences move the states off the constraint.
     sol = run(changed(y0, q=y0.q.at[1].add(1e-5)))
     assert sol.result == nhjax.RESULTS.successful
     np.testing.assert_allclose(sol.stats["max_constraint_violation"], 4e-6, rtol=1e-9)

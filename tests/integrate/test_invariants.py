@@ -76,7 +76,7 @@ def test_invariant_step_is_a_step_of_the_paper_between_two_scalings(stages):
         )
         for equation, residual in paper.residuals(oracle, step, "propagated").items():
             assert residual <= 3e-14, f"{equation}: {residual:.1e}"
-        # The closure is that of the states at the ends.
+        # The closure uses the states at the ends of the step.
         nu = multiplier[0] - continuous[k]
         sigma = (-1) ** stages
         other = multiplier[-1] - continuous[k + 1]
@@ -109,7 +109,7 @@ def test_invariant_step_on_a_group_equals_an_outer_search_for_the_scaling():
         np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-13, err_msg=name)
 
 
-# What is kept, and what stays as it was.
+# What is conserved, and what does not change.
 
 
 def on_momenta(system):
@@ -167,7 +167,7 @@ def test_invariant_energy_and_constraints_forwards_and_back_stay_at_round_off(
     np.testing.assert_allclose(energies, start, rtol=bound)
     assert float(there.stats["max_invariant_error"]) < bound
     assert float(there.stats["max_constraint_violation"]) < 3e-14
-    # Chaotic motion magnifies round-off, and so is led back for a short time.
+    # Chaotic motion magnifies round-off, so it runs back only for a short time.
     near = jax.tree.map(lambda x: x[0], run(y0, 0.01)[0].ys)
     back = jax.tree.map(lambda x: x[0], run(near, -0.01)[0].ys)
     for name in ("q", "v", "multiplier"):
@@ -254,7 +254,7 @@ def loss_of(adjoint):
     system, y0 = PARTICLE.system, PARTICLE.initial_state()
 
     def loss(x):
-        """Of the step size and of a factor of the velocities."""
+        """The variables are the step size and a factor of the velocities."""
         start = nhjax.initial_state(system, y0.q, x[1] * y0.v)
         options = {"num_steps": 6, "adjoint": adjoint, "invariants": "energy"}
         sol = nhjax.integrate(system, LobattoIIIAB(2), start, dt=x[0], **options)
@@ -326,8 +326,8 @@ def test_invariant_energy_of_a_system_that_cannot_conserve_it_raises(name):
         run_of(**REFUSED[name])
 
 
-# At the states to start from no rate tells: the first two constraints have no affine
-# part there, and the third holds at rest.
+# The initial rate of the energy does not show the work: the first two constraints have
+# no affine part there, and the third one does no work at rest.
 @pytest.mark.parametrize(
     "constraint",
     [
@@ -395,7 +395,7 @@ def swing():
 
 @pytest.mark.parametrize("dt", [0.1, 0.5])
 def test_invariant_energy_of_a_pendulum_at_turning_points_is_conserved(dt):
-    """It starts at one, at rest, and a node falls on the next by its symmetry."""
+    """It starts at one, at rest, and by symmetry a node falls on the next one."""
     sol = swing()(pendulum(1.0, 0.0)[1], dt)
     q, v = sol.ys.q[:, 0], sol.ys.v[:, 0]
     np.testing.assert_allclose(0.5 * v**2 - jnp.cos(q), -np.cos(1.0), atol=2e-15)
@@ -418,7 +418,7 @@ def test_invariant_run_from_rest_keeps_its_order(stages, counts):
             atol=1e-15,
         )
         errors.append(rms(np.concatenate([y.q, y.v], axis=1) - solved.y.T))
-    # Near rest impulses add h^(2s-2) over the number of steps since then.
+    # Near rest, an impulse adds h^(2s-2) divided by the number of steps since rest.
     assert_order(2 * stages - 2, counts, errors, floor=SCIPY_FLOOR)
 
 
@@ -428,8 +428,8 @@ def test_invariant_impulse_at_rest_vanishes():
     slope = jax.grad(
         lambda q: jnp.sum(swing()(pendulum_at(q), 0.1).ys.q[10]),
     )(0.0)
-    # The plain method, since no impulse acts on a motion this small: a Chebyshev
-    # polynomial of the factor of its second differences.
+    # No impulse acts on a motion this small, so this is the plain method: a Chebyshev
+    # polynomial of 1 - dt² / 2.
     expected = np.cos(10 * np.arccos(1 - 0.5 * 0.1**2))
     np.testing.assert_allclose(slope, expected, rtol=1e-12)
 
@@ -440,7 +440,7 @@ def pendulum_at(q):
 
 
 def test_invariant_error_near_a_saddle_stays_below_the_root_of_round_off():
-    """Where the energy is all potential impulses are ill-determined, and limited."""
+    """Where all energy is potential, impulses are ill-determined and limited."""
     sol = swing()(pendulum(np.pi - 1e-6, 0.0)[1], 0.2)
     assert sol.result == nhjax.RESULTS.successful
     error = float(sol.stats["max_invariant_error"])
@@ -521,7 +521,7 @@ def test_invariant_run_with_limited_impulse_is_not_reversible(dt, limited):
     if limited:
         assert error > 0.01
         assert off > 0.01
-        # The last step made up for the error.
+        # The last step corrected the error.
         energies = [0.5 * y.v**2 - jnp.cos(y.q) for y in (y0, there)]
         np.testing.assert_allclose(*energies, rtol=1e-14)
     else:

@@ -91,7 +91,7 @@ NULL = nhjax.LagrangianSystem(null_coordinates)
 
 def null_rates(t, z):
     x, y = z[0] + z[1], z[0] - z[1]
-    # The derivatives of sin(x) cos(y) by q_1 and q_2.
+    # The derivatives of sin(x) cos(y) with respect to q_1 and q_2.
     first = np.cos(x) * np.cos(y) - np.sin(x) * np.sin(y)
     second = np.cos(x) * np.cos(y) + np.sin(x) * np.sin(y)
     return np.array([z[2], z[3], -z[0] + 0.1 * second, -z[1] + 0.1 * first])
@@ -118,9 +118,9 @@ def test_invariant_energy_where_kinetic_energy_changes_sign_stays_in_every_membe
     """Large impulses where v·Mv nearly vanishes would spoil some members."""
     plain, walk = errors_at_the_end(name, 3, 50, None)
     kept, off = errors_at_the_end(name, 3, 50, "energy")
-    # Ten times: members without such nodes lose as much by the impulses.
+    # Impulses cost members without such nodes a factor of ten, too.
     assert np.max(kept) < 10 * np.max(plain)
-    # Where there is no impulse for a few steps, the energy goes as it does without.
+    # In the few steps without impulses, the energy changes as in the plain run.
     assert 1e-9 < np.max(off) < np.max(walk)
     assert np.mean(off < 1e-12) > 0.3
 
@@ -188,7 +188,7 @@ def test_invariant_steps_with_negative_mass_matrix_equal_the_positive_ones():
 
 
 def test_invariant_energy_with_ill_conditioned_definite_mass_matrix_is_conserved():
-    """The terms of v·Mv cancel to a part of 1e-4, which is no sign of a saddle."""
+    """The terms of v·Mv cancel to 1e-4 of their size, but M is still definite."""
     mass = np.array([[1e4, 1e4], [1e4, 1e4 + 1]])
 
     def stiff(t, q, v, args):

@@ -41,7 +41,7 @@ def test_angle_after_a_million_turns_does_not_change_the_motion(problem):
     far = jax.tree.map(lambda x: x.at[-1].add(2 * np.pi * 10**6), q0)
     if isinstance(q0, tuple):
         far = (q0[0], far[1])
-    # The nearest number to that angle, and the angle of the first turn that means it.
+    # The angle of the first turn that is equivalent to the rounded angle in `far`.
     near = system.manifold.wrapped(far, jax.tree.map(jnp.zeros_like, far))
     of_far, of_near = run(far), run(near)
     np.testing.assert_allclose(of_far.v, of_near.v, rtol=0, atol=1e-13)

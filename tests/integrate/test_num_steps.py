@@ -13,8 +13,9 @@ from support.long import long
 from support.particle_run import assert_trees_equal, PARTICLE
 
 
-# Two programs agree bit for bit in kernels as users have them; without optimisation a
-# product that is added to something may be rounded before in one and not in the other.
+# Two programs agree bit for bit only in optimised kernels, as users have them. Without
+# optimisation, one program may round a product before it is added, and the other may
+# not.
 pytestmark = pytest.mark.usefixtures("optimised_kernels")
 
 REVERSIBLE = nhjax.ReversibleAdjoint()
@@ -188,7 +189,7 @@ def test_num_steps_traced_in_reverse_mode_raises(adjoint):
 def test_num_steps_as_int_inside_a_gradient_stays_static(adjoint):
     assert np.isfinite(jax.grad(end)(0.1, 4, adjoint))
 
-    # Also where a function alone knows what is differentiated.
+    # This also holds if only a closure contains the differentiated number.
     def loss(friction):
         system = nhjax.LagrangianSystem(counted, force=lambda t, q, v, a: -friction * v)
         y0 = nhjax.initial_state(SYSTEM, PARTICLE.q0, PARTICLE.v0)
@@ -201,7 +202,7 @@ def test_num_steps_as_int_inside_a_gradient_stays_static(adjoint):
     assert jax.grad(loss)(0.1) < 0
 
 
-# What cannot be -----------------------------------------------------------------------
+# What is refused ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

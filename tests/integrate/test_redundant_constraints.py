@@ -20,8 +20,8 @@ CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.2]])
 RECORDED = nhjax.SaveAt(t0=True, steps=True, dense=True)
 
 
-# A plate on parallel rods of one length: q = (x, y, φ) of its first corner, and three
-# rods where two leave it one degree of freedom, that of a pendulum.
+# A plate on parallel rods of one length: q = (x, y, φ), (x, y) its first corner. It has
+# three rods; two would already leave it the one degree of freedom of a pendulum.
 
 
 def plate(rods, constraints: Literal["independent", "redundant"] = "independent"):
@@ -248,7 +248,7 @@ def test_redundant_nonholonomic_constraints_run(closure):
 
 
 def on_a_sphere(rows, form="lagrangian"):
-    """A particle on a sphere with a blade, whose speeds also say that it stays there.
+    """A particle on a sphere with a blade; its velocity constraints repeat the sphere.
 
     The rows are the blade, the rate of the sphere times its radius, and their sum.
     """
@@ -310,7 +310,7 @@ def sphere_with_a_blade(t, x):
 
 
 def test_redundant_rate_leaves_independent_rows_enforced_with_the_order():
-    # Of the rate and of its sum with the blade, the blade alone is new.
+    # The rate repeats the sphere, so its sum with the blade only adds the blade.
     counts = (10, 20, 40)
     q, v = jnp.array([0.6, 0.0, 0.8]), jnp.array([0.1, 0.5, 0.0])
     system = on_a_sphere((1, 2))

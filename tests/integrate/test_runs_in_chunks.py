@@ -15,7 +15,7 @@ from nhjax.systems import HeavyTopSE3
 from support.particle_run import assert_trees_close, assert_trees_equal
 
 
-# As in `test_num_steps`, programs agree bit for bit only in kernels as users have them.
+# As in `test_num_steps`, programs agree bit for bit only in optimised kernels.
 pytestmark = pytest.mark.usefixtures("optimised_kernels")
 
 METHOD = nhjax.LobattoIIIAB(3)
@@ -23,7 +23,7 @@ traces: list[int] = []
 
 
 def sled(stiffness: float) -> nhjax.LagrangianSystem:
-    """A blade on a plane with a spring; another stiffness is another program."""
+    """A blade on a plane with a spring; each stiffness compiles another program."""
 
     def lagrangian(t, q, v, args):
         traces.append(1)

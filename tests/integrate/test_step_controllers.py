@@ -118,7 +118,7 @@ def test_pid_with_a_smaller_tolerance_has_an_error_that_is_smaller_by_its_order(
     np.testing.assert_allclose(
         np.log10(errors[0] / errors[1]), 4 * p / (p + 1), rtol=0, atol=0.5
     )
-    # The number of steps grows by the tolerance to the power of 1 / (p + 1).
+    # The number of steps is proportional to the tolerance to the power -1 / (p + 1).
     np.testing.assert_allclose(
         np.log10(numbers[1] / numbers[0]), 4 / (p + 1), rtol=0, atol=0.15
     )
@@ -245,7 +245,7 @@ def test_pid_without_dt_takes_a_sensible_first_step(name):
     assert np.all(sizes > 0)
     largest = float(np.max(sizes))
     best = swing(controller, y, system, dt=largest, **options)
-    # Ten attempts find any size within the factors of 10 and 0.2.
+    # Each attempt changes the size by a factor between 0.2 and 10: ten are enough.
     assert attempts_of(sol) <= attempts_of(best) + 10
 
 
@@ -542,7 +542,7 @@ def test_derivative_by_the_end_time_is_the_velocity(adjoint):
 
     by_t0, by_t1 = jax.jit(jax.grad(end, argnums=(0, 1)))(0.2, 1.1)
     v = float(swing(PIDController(1e-8, 1e-8), t0=0.2, t1=1.1).ys.v[-1, 0])
-    # That of the discrete motion differs by the error of the method.
+    # The derivative of the discrete motion differs by the error of the method.
     np.testing.assert_allclose([by_t0, by_t1], [-v, v], rtol=1e-5)
 
 

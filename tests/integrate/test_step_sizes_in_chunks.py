@@ -14,7 +14,7 @@ from support.particle_run import assert_trees_equal
 from support.reports import new_meter
 
 
-# Programs agree bit for bit only in kernels as users have them.
+# Programs agree bit for bit only in optimised kernels, as users have them.
 pytestmark = pytest.mark.usefixtures("optimised_kernels")
 
 SLIDE = nhjax.LagrangianSystem(

@@ -71,7 +71,7 @@ def test_stages_above_the_maximum_raise(method):
 
 @pytest.mark.parametrize("method", [nhjax.LobattoIIIAB(32), nhjax.Gauss(32)])
 def test_stages_at_the_maximum_have_collocation_coefficients(method):
-    # C(q) in float64: high orders of the rounded coefficients.
+    # C(q) holds to round-off, also to high orders, for the float64 coefficients.
     for k in range(1, 33):
         np.testing.assert_allclose(
             method.a @ method.c ** (k - 1), method.c**k / k, rtol=0, atol=4e-16
@@ -106,7 +106,7 @@ def test_dt_below_round_off_in_single_precision_raises():
 def test_dt_below_round_off_under_jit_raises():
     program = jax.jit(lambda t0: run(t0=t0).ys.q)
     jax.block_until_ready(program(1.0))
-    # JAX raises one or the other, as the program runs at once or later.
+    # JAX raises either, depending on whether the program runs at once or later.
     with pytest.raises((RuntimeError, ValueError), match=r"`dt` = 0\.1 is below the"):
         jax.block_until_ready(program(1e20))
 

@@ -24,7 +24,7 @@ def call(name, *operands, shape=None):
 
 
 def printed(*command, **environment):
-    """The last line that a process of its own prints."""
+    """The last line that a separate process prints."""
     others = {key: x for key, x in os.environ.items() if key not in ("XLA_FLAGS",)}
     done = subprocess.run(
         [sys.executable, "-W", "ignore", lane_processes.__file__, *map(str, command)],
@@ -124,7 +124,7 @@ def test_lanes_compiled_code_after_new_kernel_grows():
 
 
 def test_lanes_kernel_of_a_million_characters_compiles():
-    """Its code is generated at another level than that of shorter modules."""
+    """Its code is generated at another optimisation level than for shorter modules."""
     comment = f"; {'.' * 1_000_000}\n"
     name = lanes.register_kernel(kernel_ir(TRIPLE, before=comment), 1, 1, WIDTH, True)
     x = np.arange(1001.0)
@@ -164,14 +164,14 @@ def test_lanes_kernel_called_from_more_threads_than_the_pool_finishes():
 
 @pytest.mark.parametrize("threads", [1, 2, 4])
 def test_lanes_kernel_uses_at_most_the_threads_of_the_pool(threads):
-    # The pool's threads take part if they are there: the blocks last for 0.8 s in all.
+    # The blocks last 0.8 s in all, long enough for all threads of the pool to join.
     assert printed("threads", 1, NPROC=str(threads)) == f"most: {threads}"
 
 
 def test_lanes_kernel_on_several_devices_shares_the_pool():
     flags = "--xla_force_host_platform_device_count=2"
     most = int(printed("threads", 2, NPROC="4", XLA_FLAGS=flags).split()[-1])
-    # The second device's own thread may come when there are four at work.
+    # The second device's own thread may join when four threads are at work.
     assert 2 <= most <= 5
 
 

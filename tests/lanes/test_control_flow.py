@@ -25,7 +25,7 @@ def test_lanes_loop_that_members_leave_one_by_one_keeps_results(width):
     assert_as_jax(function, width, count(30), sample(3))
 
 
-# Under `jax.vmap` lanes that have ended run inner loops on, and both sides of a branch
+# Under `jax.vmap`, finished lanes keep running inner loops, and both sides of a branch
 # run, so that JAX itself would never end here.
 
 
@@ -64,7 +64,7 @@ def test_lanes_loop_in_branch_runs_for_members_of_the_branch(width):
 
 @WIDTHS
 def test_lanes_uniform_loop_in_branch_of_no_member_does_not_run(width):
-    """Its predicate is one for all lanes, so that no mask could end it."""
+    """All lanes share the loop's predicate, so that no mask could end the loop."""
 
     def function(p, x):
         def endless(x):

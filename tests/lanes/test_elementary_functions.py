@@ -41,7 +41,7 @@ def test_lanes_elementary_function_errs_by_less_than_two_ulps(
 ):
     given = ulps.arguments(op, 0, 1500, DTYPES[dtype])
     exact = ulps.exact_values(op, given)
-    # Conversions of float32 leave little more than the last rounding.
+    # For float32, the error is little more than that of the last rounding.
     most = 0.51 if dtype == "float32" else 2
     for width in WIDTHS:
         got = native(symbol(op, dtype, width), *given)
@@ -51,7 +51,7 @@ def test_lanes_elementary_function_errs_by_less_than_two_ulps(
         assert ulps.errors(got, exact).max() < most
 
 
-# The float64 that are nearest to multiples of pi / 2, in relation to their size, and
+# The float64 numbers nearest to multiples of pi / 2, relative to their size, and
 # arguments at which the functions leave the range of float64.
 HARD = {
     "sin": [6381956970095103 * 2.0**797, np.pi, 51471.8, 51472.0, 1e300],
@@ -133,7 +133,7 @@ def test_lanes_elementary_function_at_special_values_equals_c(op, dtype, width, 
 
 
 # The largest errors that the polynomials may cause in their functions, as powers of 2;
-# powers need a logarithm of more digits, and the cube root a guess of few.
+# powers need a more accurate logarithm, and the cube root only a first guess.
 LARGEST_ERRORS = {"LOG_LONG": -66, "CBRT": -18}
 
 
@@ -159,7 +159,7 @@ def test_lanes_definitions_of_all_functions_contain_each_once():
 
 
 def test_lanes_sine_and_cosine_of_one_argument_are_one_call():
-    """LLVM merges the calls: the two cost what one does."""
+    """LLVM merges the calls: the two cost as much as one."""
     both = "\n".join(
         [
             definitions([("sin", "float64", 4), ("cos", "float64", 4)]),
@@ -189,7 +189,7 @@ TRIPLES = [
 @pytest.mark.parametrize("width", [1, 2, 8])
 @pytest.mark.parametrize("triple", TRIPLES)
 def test_lanes_elementary_functions_on_any_platform_call_no_library(triple, width):
-    """Nor is one needed by a processor without special instructions."""
+    """Processors without special instructions need no library either."""
     keys = [(op, dtype, width) for op in OPS for dtype in DTYPES]
     text = definitions(keys).replace("define internal", "define")
     assert _called_outside(text, triple) == set()
@@ -217,7 +217,7 @@ def _called_outside(text, triple):
 def _parsed(text, triple):
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
-    # With this model of memory, calls have the names of functions in them.
+    # With this code model, calls contain the names of functions.
     machine = llvm.Target.from_triple(triple).create_target_machine(
         opt=1, reloc="pic", codemodel="small"
     )

@@ -49,7 +49,7 @@ def definitions_and_calls(text):
 @pytest.mark.parametrize("width", [1, 4])
 def test_long_program_at_several_places_becomes_one_function_a_width(width):
     _, text = module_of(at_three_places(compiled_once_chain), 0.5, 0.7, width=width)
-    # The call whose operands are the same for all members computes them once.
+    # The call whose operands all members share uses a scalar function.
     assert definitions_and_calls(text) == (2 if width > 1 else 1, 3)
     _, text = module_of(at_three_places(chain), 0.5, 0.7, width=width)
     assert definitions_and_calls(text) == (0, 0)
@@ -147,7 +147,7 @@ def test_function_of_numbers_returns_three_or_four_floats_in_memory(number, dtyp
     x = np.linspace(0.2, 0.9, 5).astype(dtype)
     program, text = module_of(whole, x[0], is_batched=(True,), width=1)
     (results,) = re.findall(r"^define internal \{ (.*) \} @program", text, re.MULTILINE)
-    # Three or four would be returned in registers of the x87 unit, five are not.
+    # Three or four results would be returned in x87 registers; five are not.
     expected = 5 if number in (3, 4) else number
     assert len(re.findall("double|float", results)) == expected
     assert results.count("i1") == 1

@@ -1,8 +1,8 @@
 """Random programs in lanes, against the same programs in JAX, number by number.
 
 JAX runs them one operation after the other, so that nothing is fused or reordered, and
-the results have to be equal to the last bit; only a NaN has no sign. To run thousands:
-`NHJAX_FUZZ=5000 pytest tests/lanes/test_fuzz.py`.
+the results have to be equal to the last bit, except for the sign of a NaN. To run
+thousands: `NHJAX_FUZZ=5000 pytest tests/lanes/test_fuzz.py`.
 """
 
 import os
@@ -87,7 +87,7 @@ def test_lanes_random_program_with_arrays_in_memory_equals_jax(
 ):
     names = [name for name in sys.modules if name.startswith("nhjax.lanes.")]
     with pytest.MonkeyPatch.context() as patch:
-        # Nearly all arrays of these programs are large then, and copied in loops.
+        # With this limit, nearly all arrays count as large and are copied in loops.
         patch.setattr(_builder, "_LONGEST_UNROLLED", 1)
         for name in names:
             if hasattr(sys.modules[name], "MOST_IN_REGISTERS"):

@@ -15,8 +15,8 @@ from support.lane_kernels import kernel_ir, TRIPLE, WIDTH
 
 NUMBERS = itertools.count()
 
-# The handler's own allocation, counted, and a clock that goes on by the same time
-# whenever it is read.
+# Functions that count the handler's allocations, and a clock that advances by the same
+# time whenever it is read.
 STAND_INS = {
     "malloc": "counted_malloc",
     "free": "counted_free",
@@ -79,7 +79,7 @@ def with_handler(body, is_batched=True):
 
 
 class Program:
-    """The handler of a kernel that triples, with its allocations and clock in hand."""
+    """The handler of a kernel that triples, with these allocations and this clock."""
 
     def __init__(self, is_batched=True):
         text = _handler.shared_handler_ir()
@@ -106,7 +106,7 @@ def compiled():
 
 @pytest.fixture
 def program(compiled):
-    """A program of which a block is known to take 1 ms."""
+    """A program whose blocks are known to take 1 ms each."""
     compiled.step.value = 1_000_000
     compiled.triples(Runtime(threads=1), 1)
     assert compiled.held() == 0
@@ -114,8 +114,8 @@ def program(compiled):
     assert WORKERS.value == 0
 
 
-# The names that newer headers give, and the functions that the handler calls: others
-# may be renamed, as long as each stays in its place.
+# Names in newer headers, and functions that the handler calls. Other functions may be
+# renamed, as long as their positions do not change.
 RENAMED = {"XLA_FFI_Extension_Base": "XLA_FFI_InternalExtension"}
 CALLED = {
     "XLA_FFI_Error_Create",
@@ -211,7 +211,7 @@ def test_lanes_handler_with_tasks_in_threads_finishes(program):
 def test_lanes_handler_with_pool_that_refuses_tasks_finishes(program):
     runtime = Runtime(threads=4, schedule=lambda task: False)
     program.triples(runtime, 1001)
-    # After the first refusal no more is asked; each error is destroyed.
+    # After the first refusal no more tasks are offered; each error is destroyed.
     assert runtime.offers == 1
     assert len(runtime.messages) == 1
     assert runtime.errors == set()
@@ -285,7 +285,7 @@ def test_lanes_handler_of_short_program_asks_no_helper(program):
     program.step.value = 1_000
     program.triples(Runtime(threads=1), 1)
     runtime = Runtime(threads=8)
-    # A block takes 1 µs: up to 50 of them are quicker done than given away.
+    # A block takes 1 µs: the caller does up to 50 of them faster than helpers could.
     program.triples(runtime, 50 * WIDTH)
     assert runtime.offers == 0
     program.triples(runtime, 151 * WIDTH)
@@ -299,8 +299,7 @@ def test_lanes_handler_of_slower_call_asks_helpers_after_first_block(program):
     program.step.value = 1_000_000
     runtime = Runtime(threads=8)
     program.triples(runtime, 4 * WIDTH)
-    # One block is done, one is the caller's next: at most the two others are given
-    # away.
+    # One block is done, one is the caller's next: at most the two others are offered.
     assert runtime.offers == 2
     runtime.run_tasks()
 
@@ -330,7 +329,7 @@ def test_lanes_handler_without_memory_for_job_returns_error():
 
 
 def test_lanes_handler_of_failed_block_returns_error():
-    # The first block finds some.
+    # Only the first block finds memory.
     kernel = """
 define i1 @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {
   %is_later = icmp sgt i64 %first, 0

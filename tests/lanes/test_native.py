@@ -1,4 +1,4 @@
-"""Native code: for which machines it is made, and where it can be."""
+"""Native code: the machines it is generated for, and where it is available."""
 
 import re
 import subprocess
@@ -14,8 +14,8 @@ from support.lane_kernels import VECTORS
 
 
 LINUX = "x86_64-unknown-linux-gnu"
-# Machines that code must compile for, whichever compiles it, and a register of the
-# widest vectors of each in the product of eight numbers.
+# Machines that every machine must be able to compile for, and for each a register of
+# its widest vectors in the product of eight numbers.
 TARGETS = {
     "x86-64": (_native.Target(LINUX, "x86-64"), r"mulpd\t%xmm\d"),
     "x86-64-v3": (_native.Target(LINUX, "x86-64-v3"), r"mulpd\t%ymm\d"),
@@ -41,7 +41,7 @@ def test_lanes_kernel_and_handler_compile_for_each_platform(name):
 
 @pytest.mark.parametrize("cpu", ["skylake-avx512", "sapphirerapids", "znver4"])
 def test_lanes_kernel_with_avx512_uses_512_bit_vectors(cpu):
-    """These prefer vectors of 256 bits for what the compiler makes vectors of."""
+    """These prefer 256-bit vectors where the compiler itself vectorises."""
     machine = _native.Target(LINUX, cpu)
     text = _native.assembly([VECTORS], "kernel", machine)
     assert "%zmm" in text
@@ -84,6 +84,6 @@ def test_lanes_compiler_on_other_platforms_is_not_available(
 
 
 def test_lanes_import_without_llvmlite_has_no_compiler():
-    """Nor does the import of nhjax import llvmlite where it is."""
+    """Where llvmlite is installed, importing nhjax does not import it."""
     out = run(sys.executable, lane_processes.__file__, "without_llvmlite")
     assert out == "imported: False available: False\n"

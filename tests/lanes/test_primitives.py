@@ -1,4 +1,4 @@
-"""Every primitive that may stand in a kernel, in lanes against JAX.
+"""Every primitive that may occur in a kernel, in lanes against JAX.
 
 The data have NaN, infinities, both zeros, and the extremes of integers.
 """
@@ -100,7 +100,7 @@ def _root(x):
 
 _polynomial = getattr(lax, "polynomial", lambda x, c: (x * c[2] + c[1]) * x + c[0])
 
-# The functions that are called so in `lax`, with the dtypes that they take.
+# Functions with these names in `lax`, their numbers of operands, and their dtypes.
 _SIMPLE = {
     **dict.fromkeys(("add", "sub", "mul", "div", "max", "min", "rem"), (2, NUMBERS)),
     **dict.fromkeys(("eq", "ne", "lt", "le", "gt", "ge"), (2, (*NUMBERS, "bool"))),
@@ -126,7 +126,7 @@ _CASES = {
     "not": _unary(lax.bitwise_not, BITS),
     "nextafter": _binary(lax.nextafter, FLOATS),
     "square": _unary(lax.square, NUMBERS),
-    # Operations of JAX from 0.12 on; before, these functions consist of others.
+    # Operations since JAX 0.12; before, these functions consisted of others.
     "log2": _unary(jnp.log2, FLOATS),
     "one_minus_square": _unary(
         getattr(lax, "one_minus_square", lambda x: (1 + x) * (1 - x)), FLOATS
@@ -279,7 +279,7 @@ _CASES = {
         )
     ],
 }
-# Those that are not rounded correctly, by XLA least of all.
+# Primitives without correct rounding; XLA is the least accurate.
 _INEXACT = """
     acos acosh asin asinh atan atan2 atanh cbrt cos cosh custom_root erf exp exp2 expm1
     log log1p log2 logistic one_minus_square polynomial pow rsqrt sin sinh tan tanh

@@ -1,4 +1,4 @@
-"""The compiler is a library of its own: it imports nothing of the rest of nhjax."""
+"""The compiler is a separate library: it imports nothing from the rest of nhjax."""
 
 import re
 import subprocess
@@ -15,7 +15,7 @@ FOLDER = Path(nhjax.lanes.__file__).parent
 SOURCES = rooms.read_sources()
 IMPORTS = rooms.read_imports(SOURCES)
 
-# Load the folder as a package of another name, where there is no nhjax.
+# Load the folder as a package with another name, without nhjax.
 ALONE = """
 import importlib.util, sys
 sys.modules["nhjax"] = None
@@ -56,7 +56,7 @@ def test_lanes_compiler_without_nhjax_compiles_and_runs():
 
 
 def test_lanes_import_chains_have_at_most_five_modules():
-    # The door is the first module of a chain.
+    # `__init__` is the first module of a chain.
     assert 1 + rooms.num_floors(IMPORTS, "lanes") <= 5
 
 

@@ -1,4 +1,4 @@
-"""What a kernel leaves out, and what it may not."""
+"""What a kernel leaves out, and what it may not leave out."""
 
 import jax
 import jax.numpy as jnp
@@ -57,7 +57,7 @@ def test_lanes_loop_invariant_operations_are_hoisted():
 
 
 def test_lanes_nested_loops_are_built_in_linear_time():
-    """A loop is made anew when a number turns out not to be constant, but once."""
+    """A loop is built again, but once, if a number turns out not to be constant."""
     depth, made = 6, []
 
     def nested(level, x):
@@ -69,5 +69,5 @@ def test_lanes_nested_loops_are_built_in_linear_time():
     program = jax.make_jaxpr(lambda x: nested(depth, jnp.zeros(())) + x)(1.0)
     text = llvm_ir(program, (True,), 4)
     assert text.count("phi double") == depth
-    # Numbers that are made and dropped leave gaps.
+    # Dropped numbers leave gaps.
     assert int(text.split("%v")[-1].split()[0].strip(",")) < 400

@@ -37,7 +37,7 @@ def assert_same(got, expected, weak_types=False):
     assert jax.tree.structure(got) == jax.tree.structure(expected)
     for x, y in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
         assert (x.shape, x.dtype) == (y.shape, y.dtype)
-        # The tangents of integers have no numbers.
+        # The tangents of integers have no values.
         if x.dtype != jax.dtypes.float0:
             np.testing.assert_allclose(x, y, rtol=1e-13, atol=1e-14)
             assert not weak_types or x.weak_type == y.weak_type

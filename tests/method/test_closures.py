@@ -233,7 +233,7 @@ def test_tableau_malformed_raises(a: list, b: list, message: str):
 
 @pytest.mark.parametrize("s", STAGES)
 def test_closure_response_keeps_the_momenta_at_nodes(s: int):
-    # With λ_{k+1} changed by one, and y by the response, the multipliers change by z.
+    # If λ_{k+1} changes by one, and y by the response, the multipliers change by z.
     method = LobattoIIIAB(s, "symmetric")
     closure = method.closure_weights
     z = closure.E @ closure.response + closure.end

@@ -1,4 +1,4 @@
-"""The page about SymPy keeps its word: its code runs as printed."""
+"""The page about SymPy is right: its code runs as printed."""
 
 import numpy as np
 

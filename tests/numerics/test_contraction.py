@@ -133,7 +133,7 @@ def test_derivative_of_inverse_equals_formula():
 
 
 def test_sum_over_members_of_batch_is_not_expanded():
-    """The gradient by an operand that all members share has a term for each member."""
+    """The gradient in an operand that all members share has a term for each member."""
     matrix, vectors = jnp.ones((40, 40)), jnp.arange(40000.0).reshape(1000, 40)
 
     @jax.jit

@@ -21,7 +21,7 @@ def test_largest_column_of_matrices_contains_their_largest_number(columns, dtype
     sizes = np.max(np.abs(np.concatenate(matrices)), axis=0)
     assert int(column) == np.argmax(sizes)
     assert value.dtype == dtype
-    # The value loses as many bits as the number of the column needs.
+    # The value loses the bits that store the number of the column.
     lost = 2 * columns * float(jnp.finfo(dtype).eps)
     np.testing.assert_allclose(value, max_norm(*matrices), rtol=lost)
 

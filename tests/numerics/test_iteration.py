@@ -1,4 +1,4 @@
-"""Iterations that come to their end in unusual ways."""
+"""Iterations that end in unusual ways."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -35,7 +35,7 @@ def circling(rate, angle, units, max_iterations=200, components=1):
 def test_iteration_that_spirals_converges(rate, angle):
     solved = circling(rate, angle, 400)
     assert solved.converged
-    # What is left of the error is of the size of what is believed to be noise.
+    # The remaining error has the size of increments that are taken for noise.
     assert float(jnp.max(jnp.abs(solved.x))) < 100 * np.finfo(float).eps / (1 - rate)
 
 

@@ -1,4 +1,4 @@
-"""Functions that are traced once have the values and derivatives of the functions."""
+"""Functions that are traced once have the values and derivatives of the originals."""
 
 from unittest.mock import Mock
 
@@ -199,7 +199,7 @@ def test_kept_function_with_a_constant_result_is_compiled_by_xla(monkeypatch):
 
 
 def test_functions_of_a_system_are_called_once_for_all_uses():
-    # A mock is compared by identity, so that its count is no value that changes.
+    # A mock is compared by identity, so that its count is not a changed value.
     seen = Mock()
 
     def lagrangian(t, q, v, args):
@@ -211,7 +211,7 @@ def test_functions_of_a_system_are_called_once_for_all_uses():
     )
     q, v, stiffness = jnp.array([0.1, 0.2]), jnp.array([0.2, 1.0]), jnp.array(1.0)
     start = nhjax.initial_state(system, q, v, args=stiffness)
-    # The shape of the result is checked before.
+    # One of the calls checks the shape of the result.
     assert seen.call_count == 2
 
     def end(stiffness):

@@ -1,4 +1,4 @@
-"""Entries of Jacobians that vanish: those that do not are never missed."""
+"""Entries of Jacobians that vanish; entries that do not vanish are never missed."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from nhjax._numerics import jacobian_sparsity
 X = jnp.asarray(np.random.default_rng(3).standard_normal(12))
 PICKED = np.array([3, 1, 1, 7])
 
-# Functions whose program tells all entries that vanish.
+# Functions whose program shows all entries that vanish.
 EXACT = {
     "picked": lambda x: x[PICKED] * x[2:6],
     "rolled and reversed": lambda x: jnp.roll(x, 3) * x[::-1],
@@ -28,7 +28,7 @@ EXACT = {
     "vmap": lambda x: jax.vmap(lambda a, b: a @ b)(x.reshape(4, 3), x.reshape(4, 3)),
     "outer": lambda x: jnp.outer(x[:2], x[3:5]).reshape(-1),
 }
-# Those of which more entries are kept than differ from zero.
+# Functions of which more entries are kept than differ from zero.
 KEPT = {
     "written": lambda x: x.at[3].set(x[0]),
     "sorted": lambda x: jnp.sort(x)[:2],

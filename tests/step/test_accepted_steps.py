@@ -328,7 +328,7 @@ def test_gradient_through_fallback_steps_is_exact():
 
 
 def test_newton_with_round_off_magnified_by_stiff_forces_accepts_steps():
-    # Vibrations of 1e-5 about a length of 1, by forces of 1e10 times the length.
+    # Vibrations of 1e-5 about the position 1, by a spring of stiffness 1e10.
     def lagrangian(t, q, v, args):
         return 0.5 * v @ v - 0.5e10 * jnp.sum((q - 1.0) ** 2)
 
@@ -384,7 +384,7 @@ def test_accepted_steps_from_random_starts_are_solved(name):
 
 
 def test_doubtful_step_with_two_solutions_is_judged():
-    # Both solvers solve one of 3000 steps, and end far apart.
+    # For one of 3000 steps, the two solvers find solutions that are far apart.
     doubtful = measure_starts("Morse", 3, number=3000)["doubtful"]
     assert doubtful["two solutions"] == 1
     assert sum(doubtful[judgement] for judgement in JUDGEMENTS) == 1

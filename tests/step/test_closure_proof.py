@@ -1,8 +1,9 @@
 """The proof of the order in `docs/closures.md`, lemma by lemma, in numbers.
 
 Algebra is checked in exact rationals where the nodes are rational, and in 50 digits
-elsewhere; steps are solved in 50 digits by equations of their own. Each test also
-checks that one condition more does not hold, so that it can fail.
+elsewhere; steps are solved in 50 digits with equations written for these tests. Each
+test also checks that one further condition does not hold, which shows that the test can
+fail.
 """
 
 import jax.numpy as jnp
@@ -44,7 +45,7 @@ def at_two_sizes(function, coarse=32):
 
 
 def slope_of(function, coarse=32):
-    """The power of h of the largest entry of what a function of h returns."""
+    """The power of h in the largest entry of a function of h."""
     return slope(*(largest(value) for value in at_two_sizes(function, coarse)))
 
 
@@ -127,7 +128,7 @@ def test_operation_on_error_class_keeps_the_class_sharply(operation, name):
             assert m.contains(l, x)
             for target, image in OPERATIONS[operation](m, x, l):
                 assert m.contains(target, image)
-                # One moment more would be a condition too many.
+                # The next moment need not vanish.
                 further = max(2 * m.r + 2 - target, 0)
                 sharp |= not m.vanishes(m.moment(image, further))
     assert sharp
@@ -150,7 +151,7 @@ def test_defects_of_the_exact_motion_are_in_the_error_class(name):
     for k in range(m.r + 1, 2 * m.r + 3):
         assert m.contains(k, m.defect(k, conjugate=True))
         assert m.contains(k, m.defect(k))
-        for power in range(3):  # Those of the constraints are divided by h.
+        for power in range(3):  # Defects of the constraints are divided by h.
             preimage = m.preimage(m.c**power * m.defect(k), 0 * m.c[-1])
             assert m.contains(k - 1 + power, preimage)
     first = m.defect(m.r + 1, conjugate=True)
@@ -236,7 +237,7 @@ def test_symmetric_closure_on_other_nodes_has_an_unknown_of_order_r_plus_2(name)
 
 @pytest.mark.parametrize("s", [3, long(4)])
 def test_multiplier_error_at_start_of_order_s_minus_1_keeps_end_order(s):
-    # One power less in it costs one power at the end.
+    # One power of h less in this error costs one power at the end.
     m = lobatto(s)
 
     def end(power):
@@ -267,7 +268,7 @@ def test_symmetric_step_from_far_starting_values_is_the_same(s):
 
 
 def differences(s, first, second):
-    """First and second divided differences of (q_1, p_1) by Λ^1, as functions of h."""
+    """First and second divided differences of (q_1, p_1) in Λ^1, as functions of h."""
     m, along = lobatto(s), np.array([MP.mpf(1), MP.mpf("-0.5")])
 
     def both(h):

@@ -59,7 +59,7 @@ def states_of(name):
 def estimated_and_true(name, method, h):
     """Return the estimated and the true relative error of a step from each state.
 
-    The change of a state is the larger of those of the momentum and of q / h.
+    The change of a state is the larger of the changes of momentum and of q / h.
     """
     system, flat = STARTS[name][0], STARTS[name][0].manifold is None
 

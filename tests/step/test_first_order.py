@@ -18,10 +18,10 @@ from support.long import exhaustive, long
 
 
 def contraction(example, method, h):
-    """Return the spectral radius of an iteration, with and without the terms.
+    """Return spectral radii of an iteration with and without terms of order h.
 
     Automatic differentiation computes the derivative of the whole iteration with
-    respect to the unknowns, independently of the formulas of the terms.
+    respect to the unknowns, independently of the formulas of these terms.
     """
     system, y0, t = example.system, example.initial_state(), jnp.zeros(())
 

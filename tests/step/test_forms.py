@@ -98,8 +98,8 @@ def end_of(stages, x):
 def one_step(system, method, y0):
     """(q', p', J), J the derivative of the step in left-trivialised coordinates.
 
-    (ξ, δ) at (q, p) stands for (q τ(ξ), p + δ). By the implicit function theorem: the
-    derivative of one Newton step at the root, in which the inverse is held fixed.
+    (ξ, δ) at (q, p) stands for (q τ(ξ), p + δ). By the implicit function theorem, J is
+    the derivative of one Newton step at the root with a fixed inverse.
     """
     group, n = system.manifold_of(y0.q), y0.p.shape[0]
 
@@ -131,8 +131,8 @@ def one_step(system, method, y0):
 def canonical_form(p, rotating):
     """Ω of ω((ξ, δ), (ξ', δ')) = δ'·ξ - δ·ξ' + p·[ξ, ξ'].
 
-    ω = -dθ with θ(ξ, δ) = p·ξ, since dθ(X, Y) = X θ(Y) - Y θ(X) - θ([X, Y]), and of
-    left-invariant fields the bracket is that of the algebra.
+    ω = -dθ with θ(ξ, δ) = p·ξ, since dθ(X, Y) = X θ(Y) - Y θ(X) - θ([X, Y]), and the
+    bracket of left-invariant fields is the bracket of the algebra.
     """
     unit, zero = np.eye(3), np.zeros((3, 3))
     bracket = np.cross(unit[:, None], unit[None]) @ p if rotating else zero

@@ -1,4 +1,4 @@
-"""Steps with the frames of poses have the same equations as steps without."""
+"""Steps with the frames of poses have the same equations as steps without frames."""
 
 from dataclasses import replace
 

@@ -56,7 +56,7 @@ def slope_at_solution(system, y0, method, h):
     ids=lambda x: type(x).__name__,
 )
 def test_full_iteration_at_a_solution_has_no_slope(example, method):
-    # This holds for Newton's method alone: all other iterations contract slower.
+    # Only Newton's method reaches this: all other iterations contract more slowly.
     slope = slope_at_solution(example.system, example.initial_state(), method, 0.05)
     np.testing.assert_allclose(slope, 0, atol=1e-12)
 
@@ -65,8 +65,8 @@ def test_full_iteration_at_a_solution_has_no_slope(example, method):
     "constraint", [long("none"), long("holonomic"), "nonholonomic"]
 )
 def test_full_iteration_of_hamiltonian_form_contracts_fast(constraint):
-    # The velocities of stages are evaluated once an iteration, at positions that do
-    # not include their last change, which is quadratically small in the iteration.
+    # Each iteration evaluates the stage velocities once, at positions without their
+    # last change, which decreases quadratically.
     start = in_space(constraint, True)
     given = start.forms["hamiltonian"], start.y0, nhjax.LobattoIIIAB(2)
     slope = slope_at_solution(*given, 0.05)

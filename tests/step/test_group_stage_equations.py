@@ -1,6 +1,6 @@
 """Steps on groups and with holonomic constraints satisfy the paper's equations.
 
-In both forms, by the independent residuals of `paper_group_equations`.
+Both forms are checked by the independent residuals of `paper_group_equations`.
 """
 
 from functools import cache
@@ -85,7 +85,7 @@ def over(cases):
 
 @cache
 def steps_of(case):
-    """Return three steps; the first one starts from a generic state, too."""
+    """Return three steps; even the first one starts from a generic state."""
     return solved_steps(
         case.problem.forms[case.form],
         nhjax.LobattoIIIAB(case.stages, case.closure, case.chart),
@@ -214,10 +214,10 @@ def test_velocity_and_momentum_of_group_steps_obey_legendre_transform(case):
             pairs = zip(elements, momenta, strict=True)
             fibre = np.stack([mechanics.d2h(g, mu) for g, mu in pairs])
         known = taken.stages.node_fibre_coordinate
-        # An iteration ends when increments of up to 30 eps no longer fall, relative to
-        # the momenta plus their change by forces in a step. The state is the sum of the
-        # forces and does not contain the last increment, but interior nodes contain it.
-        # With three releases of JAX the largest difference is 62 eps.
+        # An iteration can end with increments of up to 30 eps that no longer fall,
+        # relative to the momenta plus their change by forces in a step. Interior nodes
+        # contain the last increment; the state, which is the sum of the forces, does
+        # not. With three releases of JAX the largest difference is 62 eps.
         size = np.max(np.abs(fibre)) + STEP * np.max(np.abs(taken.force))
         atol = 100 * np.finfo(float).eps * size
         np.testing.assert_allclose(known, fibre[-len(known) :], rtol=0, atol=atol)

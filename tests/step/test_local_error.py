@@ -17,7 +17,7 @@ from nhjax._step import local_error
 
 
 class Probe(AbstractStepSizeController):
-    """Equal steps, which keep the estimated error of the last one as their memory."""
+    """Takes equal steps; the memory is the estimated error of the last step."""
 
     position: float = 1.0
     fibre: float = 1.0
@@ -150,14 +150,14 @@ SIZES = {2: 0.05, 3: 0.12, 4: 0.25}
 
 
 def assert_near_true_errors(run, name, h, order):
-    """The estimate has the order and, but for rare states, the size of the error."""
+    """The estimate has the order and, except for rare states, the size of the error."""
     (one, true), (half, true_half) = (run(states_of(name), x) for x in (h, 0.5 * h))
     slopes = np.log2(np.median(one / half)), np.log2(np.median(true / true_half))
     np.testing.assert_allclose(slopes, order, rtol=0, atol=0.3)
     ratios = np.concatenate([one / true, half / true_half])
     assert 1e-2 < np.median(ratios) < 1e2
     assert np.percentile(ratios, 90) < 1e2
-    # An error that is not seen is worse than one that is not there.
+    # To underestimate an error is worse than to overestimate it.
     assert np.min(ratios) > 1e-2
 
 
@@ -176,7 +176,7 @@ def test_local_error_along_a_motion_has_the_size_and_order_of_the_true_error(
     assert_near_true_errors(run, name, SIZES[stages], 2 * stages - 1)
 
 
-# With two stages their difference may vanish for a step, as the documentation says.
+# With two stages, the estimate may vanish, as the documentation says.
 @pytest.mark.parametrize(
     "name", ["pendulum", *(pytest.param(x, marks=pytest.mark.long) for x in ("top",))]
 )
@@ -226,7 +226,7 @@ def test_local_error_of_a_hamiltonian_system_scales_positions_and_momenta():
     q, v, method = jnp.array([0.4]), jnp.array([0.9]), LobattoIIIAB(3)
     y = nhjax.initial_state(lagrangian, q, v)
     z = nhjax.initial_state(hamiltonian, q, p=mass * v)
-    # An error of v is one of p = m v in units that are m times larger.
+    # An error of v equals an error of p = m v in units that are m times larger.
     one = estimate_of(lagrangian, method, y, 0.2, Probe(0.7, 0.2))[0]
     other = estimate_of(hamiltonian, method, z, 0.2, Probe(0.7, 0.6))[0]
     np.testing.assert_allclose(one, other, rtol=1e-12)

@@ -158,7 +158,7 @@ def test_noise_of_function_with_large_constant_includes_its_round_off(constant):
 
 @pytest.mark.parametrize("phase", [0.0, 0.4, np.pi / 2])
 def test_noise_of_smooth_function_in_units_of_any_size_is_round_off(phase):
-    # The function changes direction within a length of 1 to 1e-10.
+    # The function varies over a length between 1 and 1e-10.
     lengths = 10.0 ** jnp.arange(-10, 0.25, 0.25)
 
     def noise(length):
@@ -170,7 +170,7 @@ def test_noise_of_smooth_function_in_units_of_any_size_is_round_off(phase):
 @pytest.mark.parametrize("unit", [1e-12, 1e6, 1e15])
 def test_run_with_time_in_other_units_equals_run_in_seconds(unit):
     def after(unit):
-        """Drive at 10 rad/s, with the time measured in so many seconds."""
+        """Drive at 10 rad/s, with time in units of `unit` seconds."""
         system = nhjax.LagrangianSystem(
             lambda t, q, v, args: 0.5 * v @ v / unit**2 - 0.5 * q @ q,
             holonomic=lambda t, q, args: q[0] - q[1] ** 2 - jnp.sin(10 * unit * t),
@@ -211,7 +211,7 @@ def test_start_that_violates_height_by_more_than_round_off_is_refused(error):
         nhjax.initial_state(system, q, jnp.zeros(3))
 
 
-# A height above which a weight balances, with a constant that cancels where q is small.
+# A constraint on the height of a weight; its constants cancel where q is small.
 def height(t, q, args):
     return ((1.02 + q[1]) * jnp.cos(q[2]) - 1.02 - q[0])[None]
 
@@ -275,7 +275,7 @@ def test_energy_with_constants_that_cancel_is_conserved_near_rest(speed, dt, sol
 
 
 def test_event_condition_within_round_off_of_zero_starts_at_zero():
-    # At rest, at the start, the condition is -2e-16; then it increases.
+    # At the start, at rest, the condition is -2e-16; then it increases.
     system = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v + q[0])
     y0 = nhjax.initial_state(system, jnp.array([0.0, 1.5e-8]), jnp.zeros(2))
     event = nhjax.Event(lambda t, y, args: (1.02 + y.q[0]) * jnp.cos(y.q[1]) - 1.02)

@@ -90,8 +90,8 @@ def assert_equations_hold(name, run, closure, tolerance=TOLERANCE):
 every_closure = pytest.mark.parametrize("closure", CLOSURES)
 
 
-# The equations do not depend on the solver, which takes long to compile if it is dense:
-# with it, each number of stages and each closure are there, not each pair of them.
+# The equations do not depend on the solver. The dense solver takes long to compile, so
+# it runs with each number of stages and each closure, but not with each pair of them.
 @pytest.mark.parametrize(
     ("stages", "solver", "closure"),
     [
@@ -145,7 +145,7 @@ def test_equations_of_the_paper_for_large_steps_hold_to_round_off():
     )
     for name in ("particle", "chaotic", "sleigh"):
         run = part_of(run_of(sol, h=0.4), name)
-        # Round-off of a step is larger by its size: with three releases of JAX and of
+        # Round-off grows with the size of the step: with three releases of JAX and of
         # its compiler the largest residual is 0.9e-14, 1.0e-14 and 1.5e-14.
         assert_equations_hold(name, run, "symmetric", tolerance=3e-14)
 

@@ -132,9 +132,9 @@ def test_steps_of_spherical_pendulum_keep_vertical_angular_momentum(form):
 def discrete_action(mechanics, tableau, h, g, g_next, H, chart):
     """h Σ b_i ℓ(g_o τ(y^i), dτ_yi H^i); H^s follows from the ends of the chart.
 
-    With the origin g_o = g at the start, τ(ξ) leads to g_next; in the middle τ(ξ/2)
-    leads from g to g_o, and again to g_next. For Cayley's map on rotations, and
-    analytic in all arguments.
+    With the origin g_o = g at the start, τ(ξ) leads to g_next; in the middle, τ(ξ/2)
+    leads from g to g_o and from g_o to g_next. This uses Cayley's map on rotations, and
+    is analytic in all arguments.
     """
     a, b, group = tableau.a, tableau.b, mechanics.group
     turn, unit = np.linalg.solve(g, g_next), np.eye(len(g))

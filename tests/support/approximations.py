@@ -1,9 +1,10 @@
 """The polynomials of the elementary functions, computed and judged by mpmath.
 
-Most functions are a few exact terms and a polynomial for the rest, the tail. A tail's
-share says how much of its error enters the function's relative error. The polynomials
-interpolate at Chebyshev's nodes, which is within a small factor of the best that there
-is. `python tests/support/approximations.py` prints the module with the coefficients.
+Most functions are a few exact terms plus a polynomial for the rest, called the tail. A
+tail's share is the factor by which its error enters the function's relative error. The
+polynomials interpolate at Chebyshev nodes; their error is within a small factor of the
+smallest possible. `python tests/support/approximations.py` prints the module with the
+coefficients.
 """
 
 from collections.abc import Callable
@@ -13,12 +14,12 @@ import mpmath
 from mpmath import mp, mpf
 
 
-# Numbers of mpmath, whose class is an attribute of a context before mpmath 1.4.
+# Numbers of mpmath; before mpmath 1.4 their class is an attribute of a context.
 Real = Any
 
 
 class Approximation(NamedTuple):
-    """A tail as a function of the polynomial's argument, its share, and where."""
+    """A tail and its share as functions of the polynomial's argument, and its range."""
 
     tail: Callable[[Real], Real]
     share: Callable[[Real], Real]
@@ -37,7 +38,7 @@ def _log_ratio(z: Real) -> Real:
 HALF_LN2, QUARTER_PI = 0.34658, 0.78540
 # log(1 + f) with f from sqrt(1/2) - 1 to sqrt(2) - 1 is 2 artanh(s), s = f / (2 + f).
 S_SQUARED = 0.029438
-# Of the complementary error function the argument is 1 / (x + 2) less this.
+# For the complementary error function, the argument is 1 / (x + 2) minus this.
 ERFC_CENTRE = 0.229
 
 APPROXIMATIONS = {
@@ -129,8 +130,8 @@ def worst_error(name: str, polynomial: tuple[float, ...], points: int = 401) -> 
         width = mpf(given.upper) - mpf(given.lower)
         worst = mpf(0)
         for k in range(points + 1):
-            # Points lie closer together at the ends, where the error is largest; with
-            # an even number of them none is in the middle, where there may be a 0.
+            # Points lie closer together at the ends, where the error is largest; since
+            # their number is even, none is in the middle, where the tail may be 0 / 0.
             angle = mp.pi * (k + 0.5) / (2 * points + 2)
             t = mpf(given.lower) + width * mpmath.sin(angle) ** 2
             value = sum(c * t**power for power, c in enumerate(polynomial))

@@ -1,4 +1,4 @@
-"""Every feature in brief, as a program of its own: each prints its name if it holds."""
+"""A program that tries each feature briefly and prints the names of working ones."""
 
 import jax
 
@@ -20,8 +20,8 @@ if __name__ == "__main__":
     for name, function in FEATURES.items():
         try:
             function()
-        # Whatever is wrong with a feature, the others are tried too; the test of this
-        # one fails, since its name does not stand alone on a line.
+        # If a feature fails, the others are still tried; the test of the failed one
+        # fails, since its name is not alone on a line.
         except Exception as error:
             print(f"{name}: {type(error).__name__}: {error}".replace("\n", " "))
         else:

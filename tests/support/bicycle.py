@@ -1,8 +1,8 @@
 """The Whipple bicycle by Kane's method, and the linear equations of the benchmark.
 
-Vectors and their rates are written out, in NumPy: no Lagrangian, no derivative by a
-program, and in place of constraints and multipliers the rolling rear wheel and the
-force of the ground on the front one.
+Vectors and their rates are written out in NumPy, without a Lagrangian or automatic
+derivatives. The rolling of the rear wheel and the force of the ground on the front
+wheel replace constraints and multipliers.
 """
 
 import math
@@ -35,7 +35,7 @@ DOWN = np.array([0.0, 0.0, 1.0])
 
 
 def parameters_of(bicycle):
-    """The same numbers as `BENCHMARK` names them, of a bicycle of the gallery."""
+    """The parameters of a bicycle of the gallery, named as in `BENCHMARK`."""
     b = bicycle
     values = (b.wheelbase, b.trail, b.tilt, b.gravity)
     values += (b.rear_radius, b.rear_wheel_mass, b.rear_wheel_inertia)
@@ -59,7 +59,7 @@ def _inertia(values):
 
 
 def _arm(radius, axle, axle_rate):
-    """From a hub to the contact, and the rate of that vector."""
+    """The vector from a hub to the contact, and its rate."""
     below = DOWN - axle[2] * axle
     rate = -axle_rate[2] * axle - axle[2] * axle_rate
     size = math.sqrt(below @ below)
@@ -72,7 +72,7 @@ def accelerations(parameters, q, v, torque=0.0):
     P = parameters
     yaw, lean, pitch, steer = q[2:6]
     u = v[2:]
-    # Axes of the six angles in space, each with the rates of those before it.
+    # Axes of the six angles in space; each axis turns with the angles before it.
     x, y, z = np.eye(3)
     R1 = _turn(z, yaw)
     R2 = R1 @ _turn(x, lean)
@@ -98,7 +98,7 @@ def accelerations(parameters, q, v, torque=0.0):
     bias = {k: u @ (rates * np.array(m)[:, None]) for k, m in members.items()}
 
     def along(points, body, arm, arm_rate):
-        """From (partial velocities, bias of acceleration) across an arm of a body."""
+        """Move (partial velocities, bias of acceleration) along an arm of a body."""
         partials, extra = points
         extra = extra + np.cross(bias[body], arm) + np.cross(spins[body], arm_rate)
         return partials + np.cross(partial[body], arm), extra
@@ -203,7 +203,7 @@ def canonical(parameters):
 def linear_motion(parameters, speed, gains=(0.0, 0.0)):
     """The matrix of (lean, steer, lean rate, steer rate) about straight running.
 
-    `gains` are those of a steer torque K φ + D φ̇.
+    `gains` are K and D of a steer torque K φ + D φ̇.
     """
     M, C1, K0, K2 = canonical(parameters)
     stiffness = parameters["g"] * K0 + speed**2 * K2
@@ -215,6 +215,6 @@ def linear_motion(parameters, speed, gains=(0.0, 0.0)):
 
 
 def forces(on_wheels):
-    """Those of the forces of the ground that multipliers stand for."""
+    """The components of the ground forces that the multipliers represent."""
     rear, front = on_wheels
     return np.concatenate([rear[:2], front])

@@ -1,7 +1,7 @@
 """A ball in a turning bowl, by Newton and Euler in space, in NumPy alone.
 
 The ball is (x, w, R): its centre, its angular velocity in space and its attitude as a
-matrix. The centre moves on z = κ/2 (x² + y² + ε z²), and n is the normal of that.
+matrix. The centre moves on z = κ/2 (x² + y² + ε z²), whose unit normal is n.
 """
 
 from dataclasses import dataclass
@@ -33,15 +33,15 @@ class Bowl:
         return slope, slope / np.sqrt(slope @ slope)
 
     def velocity(self, x, w):
-        """That of the centre, by rolling on the bowl as it turns."""
+        """The velocity of the centre, as the ball rolls on the turning bowl."""
         _, n = self.normal(x)
         return self.rate * cross(UP, x - self.radius * n) + self.radius * cross(w, n)
 
     def accelerations(self, x, w):
         """(ẍ, w', F) with the force F of the bowl.
 
-        Of m (ẍ + g e₃) = F, I w' = -a n × F and the velocity differentiated, ẍ = k + a
-        w' × n, where (n × y) × n is y without its part along n.
+        They solve m (ẍ + g e₃) = F, I w' = -a n × F and the differentiated velocity,
+        ẍ = k + a w' × n; (n × y) × n is y without its part along n.
         """
         m, a, g = self.mass, self.radius, self.gravity * UP
         slope, n = self.normal(x)

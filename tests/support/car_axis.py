@@ -1,7 +1,7 @@
 """The car axis in two coordinates without constraints, by Newton's equations.
 
-The left end is at s along the line through the origin that is perpendicular to the line
-of the wheels, which turns by the known angle φ(t); the axle stands at the angle α.
+The line of the wheels turns by the known angle φ(t). The left end is at s n, where n is
+the unit vector perpendicular to this line; the axle has the angle α.
 """
 
 import numpy as np
@@ -57,13 +57,13 @@ def motion(t, y):
 
 
 def velocity_field(t, y):
-    """That of (s, α, ṡ, α̇) and of the work that the road does."""
+    """The rates of (s, α, ṡ, α̇) and of the work that the road does."""
     s, _, ds, dalpha, _ = y
     phi, dphi, _ = wheel_angle(t)
     e, n = axes(phi)
     _, (dds, ddalpha), (reaction, _) = motion(t, y[:4])
-    # The reaction acts at the left end along e, and the spring at the wheel, that moves
-    # along n.
+    # The reaction acts at the left end along e. The spring acts at the wheel, which
+    # moves along n.
     end = s * n + L * axes(y[1])[0]
     pull = (spring_force(end, L * e) + MASS * G * np.array([0.0, 1.0])) @ n
     power = reaction * L * (e @ (-s * dphi * e)) + pull * L * dphi

@@ -2,7 +2,7 @@
 
 The velocities follow from the speed by the geometry of the wheels, the speed from the
 balance of power, and the forces of the ground from Newton's and Euler's laws, body by
-body. No Lagrangian, no multipliers, no derivative by a program.
+body. No Lagrangian, multipliers or automatic derivatives are used.
 """
 
 import math
@@ -26,7 +26,7 @@ def per_trailer(car, name):
 
 
 class Train:
-    """A car with trailers: its state is (q, speed, rate of the front wheels)."""
+    """A car with trailers: its state is (q, speed, steer rate)."""
 
     def __init__(self, car):
         self.n = car.num_trailers
@@ -37,9 +37,9 @@ class Train:
         self.trailers = [per_trailer(car, name) for name in names]
 
     def ratios(self, q, steer_rate_over_speed):
-        """Speeds and turn rates of all axles over that of the car, and their slopes.
+        """Speeds and turn rates of all axles per speed of the car, and their slopes.
 
-        The slopes are rates over the distance that the car's rear axle goes.
+        The slopes are derivatives by the distance that the car's rear axle has covered.
         """
         theta, delta = q[2], q[3]
         r, k = [1.0], [math.tan(delta) / self.L]
@@ -67,7 +67,8 @@ class Train:
         own = inertia + m * ahead**2
         whole = np.sum(m * r**2 + own * k**2)
         slope = 2 * np.sum(m * r * dr + own * k * dk) * speed
-        # The power of the torque on the front wheels that does not turn them in space.
+        # `-torque * k[0]`: the torque's power (per speed) not spent on turning the
+        # wheels.
         push = drive - torque * k[0] - 0.5 * slope * speed
         acceleration = push / whole
         turn = k * speed
@@ -89,7 +90,7 @@ class Train:
         return second, self.ground(q, m, inertia, centres, turning, drive, torque)
 
     def ground(self, q, m, inertia, centres, turning, drive, torque):
-        """Forces on the rear and front axle and on those of the trailers."""
+        """Forces on the rear and front axles and on the axles of the trailers."""
         pulled = np.zeros(2)
         forces = []
         for i in reversed(range(self.n)):
@@ -110,7 +111,7 @@ class Train:
         moment = inertia[0] * turning[0] + torque
         moment += (self.a + behind) * left(heading) @ pulled
         across = left(heading) @ total
-        # Of the front force the sideways part acts at the front axle.
+        # Only the sideways part of the front force has a moment about the rear axle.
         front = (moment + self.a * across) / self.L / math.cos(delta)
         rear = across - front * math.cos(delta)
         assert abs(along(heading) @ total + front * math.sin(delta)) < 1e-9 * (
@@ -147,8 +148,8 @@ class Train:
 class Robot:
     """A robot on two driven wheels: its state is (q, speed, turn rate).
 
-    With the forces of the ground ahead on the wheels eliminated by their rotation,
-    Newton's and Euler's laws for the whole robot are equations of speed and turn rate
+    The rotation of the wheels eliminates the forward ground forces. Newton's and
+    Euler's laws for the whole robot then give the rates of speed and turn rate
     (Dhaouadi and Abu Hatab, 2013).
     """
 
@@ -168,12 +169,12 @@ class Robot:
         return ahead / (m + rolling), moment / (whole + self.b**2 * rolling)
 
     def accelerations(self, q, speed, turn, on_right=0.0, on_left=0.0):
-        """(q̈, forces of the ground: aside, ahead on the right and the left wheel)."""
+        """(q̈, ground forces: sideways, and forward on right and left wheel)."""
         push, twist = self.changes(speed, turn, on_right, on_left)
         axle = push * along(q[2]) + speed * turn * left(q[2])
         wheels = np.array([push + self.b * twist, push - self.b * twist]) / self.r
         ahead = (np.array([on_right, on_left]) - self.Iw * wheels) / self.r
-        # Newton's law to the left of the heading, where the wheels balance.
+        # Newton's law to the left of the heading; `twist` of the two wheels cancels.
         aside = (self.m + 2 * self.mw) * speed * turn + self.m * self.d * twist
         return np.concatenate([axle, [twist], wheels]), np.array([aside, *ahead])
 

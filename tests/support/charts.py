@@ -22,7 +22,7 @@ def dual(matrices, covectors):
 class AtStart:
     """The paper's chart: the maps at Ξ^i = h Σ a_ij H^j and at ξ_{k,k+1} = h Σ b_j H^j.
 
-    Those of all stages are stacked.
+    The maps of all stages are stacked.
     """
 
     def __init__(self, group: MatrixGroup, tableau, h, g, H):
@@ -50,8 +50,8 @@ class AtStart:
     def momenta(self, found, mu, N, Pi, mu_next):
         """The equations for M_k^i and μ_{k+1}; N with the Lagrangian sign. Returns μ^i.
 
-        Both Lie-group summaries: the third, fifth and fourth lines, with the definition
-        of M_k^i in the second half substituted into the third.
+        They are the third, fifth and fourth lines of both Lie-group summaries. The
+        definition of M_k^i in the second half is substituted into the third line.
         """
         a, b, h = self.tableau.a, self.tableau.b, self.h
         ratio = a.T / b[:, None]  # a_ji / b_i
@@ -77,7 +77,7 @@ class AtStart:
 
 
 class InTheMiddle(AtStart):
-    """The chart of which g_k is τ(-ξ/2) and g_{k+1} is τ(ξ/2), seen from its origin."""
+    """The chart around an origin from which g_k is τ(-ξ/2) and g_{k+1} is τ(ξ/2)."""
 
     def __init__(self, group: MatrixGroup, tableau, h, g, H):
         self.tableau, self.h = tableau, h
@@ -97,7 +97,7 @@ class InTheMiddle(AtStart):
     def momenta(self, found, mu, N, Pi, mu_next):
         """The equations that make the discrete action stationary. Returns μ^i.
 
-        ξ enters the action by the coordinates y^i = Ξ^i - ξ/2 and by the origin.
+        ξ enters the action through the coordinates y^i = Ξ^i - ξ/2 and the origin.
         """
         a, b, h = self.tableau.a, self.tableau.b, self.h
         M = np.linalg.solve(self.start_Ad.T, mu)  # Ad*_τ(-ξ/2) M = μ_k

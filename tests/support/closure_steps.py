@@ -14,7 +14,7 @@ from support.collocation import Collocation, inverse, motion, MP, newton, number
 
 
 class Errors(NamedTuple):
-    """What a step does wrong, at its stages and at its end."""
+    """The errors of a step at its stages and at its end."""
 
     stages: np.ndarray  # of velocities, forces and multipliers: one row for each stage
     end: np.ndarray  # of positions and momenta
@@ -122,7 +122,7 @@ def initial_velocity() -> np.ndarray:
 class Step:
     """The equations of one step of size h from (Q0, initial_velocity()).
 
-    With `sign` the closure is symmetric, and with None Λ^1 is given.
+    If `sign` is given, the closure is symmetric; if it is None, Λ^1 is given.
     """
 
     def __init__(self, method: Collocation, h: Any, sign: int | None = None):
@@ -157,7 +157,7 @@ class Step:
         return Q, P, V, W, p, v, multipliers, nu
 
     def solve(self, first: Any = None, guess: np.ndarray | None = None) -> tuple:
-        """Solve the equations, from constant velocities or from a guess of them."""
+        """Solve the equations, starting from a guess or from constant velocities."""
         s = self.method.stages
         first = self.lambda0 if first is None else first
 
@@ -241,12 +241,12 @@ def uncayley(rotation: np.ndarray) -> np.ndarray:
 
 
 def tangent(y: np.ndarray) -> np.ndarray:
-    """The map from the velocity of y to that of the body."""
+    """The map from the velocity of y to the body velocity."""
     return 2 / (4 + y @ y) * (2 * IDENTITY - hat(y))
 
 
 def curvature(y: np.ndarray, H: np.ndarray, momentum: np.ndarray) -> np.ndarray:
-    """The derivative of <momentum, tangent(y) H> by y."""
+    """The derivative of <momentum, tangent(y) H> with respect to y."""
     size, turn = 4 + y @ y, hat(H) @ momentum
     return -4 * y / size**2 * (2 * momentum @ H - y @ turn) - 2 / size * turn
 
@@ -259,12 +259,12 @@ def torque(R: np.ndarray) -> np.ndarray:
 
 
 def condition(R: np.ndarray, w: np.ndarray) -> Any:
-    """Veselova's constraint with two terms more, one of them quadratic."""
+    """Veselova's constraint with two more terms, one of them quadratic."""
     return (R @ w)[2] - CUBIC * w[0] * w[1] + TILT * R[0, 0] * w[2]
 
 
 def direction(R: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """The derivative of the constraint by w."""
+    """The derivative of the constraint with respect to w."""
     more = [-CUBIC * w[1], -CUBIC * w[0], TILT * R[0, 0]]
     return R[2] + np.array(more, dtype=object)
 

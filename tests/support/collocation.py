@@ -81,7 +81,7 @@ class Collocation:
 
     @property
     def r(self) -> int:
-        """The number for which D(r) holds, p - s."""
+        """The number r = p - s for which D(r) holds."""
         return self.p - self.stages
 
     @cached_property
@@ -120,7 +120,7 @@ class Collocation:
         return np.concatenate([[first], rest])
 
     def defect(self, m: int, conjugate: bool = False) -> np.ndarray:
-        """Σ_j a_ij c_j^(m-1) - c_i^m / m, or that of â."""
+        """Σ_j a_ij c_j^(m-1) - c_i^m / m, or the same with â."""
         a = self.a_hat if conjugate else self.a
         return a @ self.c ** (m - 1) - self.c**m / m
 
@@ -153,7 +153,7 @@ def newton(
     x: np.ndarray,
     inverse_jacobian: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Solve equations, with a Jacobian of differences that is computed once."""
+    """Solve equations with a finite-difference Jacobian that is computed once."""
     at = residual(x)
     if inverse_jacobian is None:
         step, columns = MP.mpf(10) ** -20, []
@@ -199,5 +199,5 @@ def largest(x: Any) -> Any:
 
 
 def slope(coarse: Any, fine: Any) -> float:
-    """The power of h between values at h and at h / 2."""
+    """The power of h that fits values at h and at h / 2."""
     return float(MP.log(coarse / fine, 2))

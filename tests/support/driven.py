@@ -1,4 +1,4 @@
-"""The system in which everything plays a part: time, a parameter, a force, `args`."""
+"""A system that uses everything: time, a parameter, a force and `args`."""
 
 from typing import Any
 
@@ -39,7 +39,7 @@ class Driven(eqx.Module):
 
     @property
     def system(self) -> nhjax.LagrangianSystem:
-        """All of it, with the parameters for leaves."""
+        """The complete system, with the parameters as leaves."""
         return nhjax.LagrangianSystem(
             self.lagrangian, nonholonomic=self.constraint, force=self.friction
         )

@@ -11,7 +11,7 @@ BAD = (3, 8)
 
 
 def start(x):
-    """A short run; where x is not a number it fails."""
+    """A short run, which fails if x is NaN."""
     y0 = SYSTEM.initial_state()
     y0 = nhjax.State(y0.q.at[0].set(x), y0.v, y0.p, y0.multiplier)
     saveat = nhjax.SaveAt(steps=True, fn=SYSTEM.system.energy)

@@ -13,7 +13,7 @@ traces: list[int] = []
 
 
 def end(lagrangian: Any, saveat: SaveAt | None = None, **parts: Any) -> np.ndarray:
-    """Where a particle ends that starts at rest: -½ g."""
+    """The end of a particle that starts at rest: -½ g."""
     system = nhjax.LagrangianSystem(lagrangian, **parts)
     y0 = nhjax.initial_state(system, jnp.zeros(2), jnp.zeros(2))
     sol = nhjax.integrate(

@@ -1,4 +1,4 @@
-"""Derivatives in brief, and the programs that are compiled, as users run them."""
+"""Short tests of derivatives and of the compiled programs, as users run them."""
 
 import contextlib
 import os
@@ -23,7 +23,7 @@ from support.user_features import (
 
 @contextlib.contextmanager
 def compiled_by(engine: str) -> Iterator[None]:
-    """Let one engine compile all programs, also if a feature fails."""
+    """Let one engine compile all programs; end this also if a feature fails."""
     os.environ["NHJAX_ENGINE"] = engine
     try:
         yield
@@ -67,7 +67,7 @@ def gradients_of_a_batch_by_the_reversible_adjoint():
 
 @feature
 def gradients_of_an_ensemble_in_its_projected_starts():
-    """Of 40 members, by every engine.
+    """Check 40 members, with every engine.
 
     Kernels whose parameters turn out to be unused or constant abort XLA's compiler.
     """
@@ -107,9 +107,9 @@ def second_derivatives():
 
 @feature
 def one_kernel_in_the_compiled_program():
-    """All steps are one operation of the program that XLA has compiled, by default.
+    """By default, all steps are one operation of the compiled XLA program.
 
-    The round-off of the system is measured by another one, before them.
+    Another operation before them measures the round-off of the system.
     """
     y0 = PARTICLE.initial_state()
     compiled = {}

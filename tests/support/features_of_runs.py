@@ -1,4 +1,4 @@
-"""What runs save, keep and tell, and many of them at once, as users run them."""
+"""Short tests of outputs, invariants, reports and ensembles, as users run them."""
 
 import os
 import tempfile
@@ -73,7 +73,7 @@ def labelled_data():
 
 @feature
 def events_that_reset_and_end():
-    """A ball falls from 1/2 in unit time and rises with half of its speed."""
+    """A ball falls from height 1/2 in unit time and rebounds with half its speed."""
     ball = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v - args * q[0])
     bounce = nhjax.Event(
         lambda t, y, args: y.q[0],

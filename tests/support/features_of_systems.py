@@ -1,4 +1,4 @@
-"""Systems, methods and solvers in brief, as users run them."""
+"""Short tests of systems, methods and solvers, as users run them."""
 
 from typing import Any
 

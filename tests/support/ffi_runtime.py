@@ -1,7 +1,7 @@
-"""A stand-in for XLA's runtime that calls handlers, made from the header's text.
+"""A stand-in for XLA's runtime that calls handlers, built from XLA's header.
 
-The structures are read from `xla/ffi/api/c_api.h` and laid out by ctypes, which does it
-as the platform's C compiler does. Nothing is shared with what nhjax knows of them.
+The structures are read from `xla/ffi/api/c_api.h` and laid out by ctypes, as the
+platform's C compiler does. nhjax's own description of them is not used.
 """
 
 import ctypes
@@ -36,7 +36,7 @@ def _field(line: str, structs: dict[str, type[ctypes.Structure]]) -> tuple[str, 
     kind, name = line.rsplit(" ", 1)
     if "*" in kind:
         return name, ctypes.c_void_p
-    # What is neither plain nor a structure is an enumeration or a set of bits.
+    # A type that is neither plain nor a structure is an enumeration or a bit set.
     return name, structs.get(kind) or _PLAIN.get(kind, ctypes.c_int32)
 
 
@@ -56,13 +56,13 @@ def _at(name: str, address: int) -> ctypes.Structure:
 
 
 class Runtime:
-    """A runtime with a pool of threads that do what a test wants them to do.
+    """A runtime whose thread pool does what a test prescribes.
 
     **Arguments:**
 
-    - `threads`: how many threads it says that its pool has; if none, it has no pool.
-    - `schedule`: what is done with a task, a function without arguments. It returns
-        whether the pool has taken it. By default tasks are kept in `tasks`.
+    - `threads`: the reported size of its pool; if None, it has no pool.
+    - `schedule`: receives a task, which is a function without arguments, and returns
+        whether the pool has accepted it. By default tasks are stored in `tasks`.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Runtime:
         self.threads = threads
         self.schedule = schedule or self.keep
         self.tasks: list[Callable[[], None]] = []
-        # How often a task was offered, errors that live, and messages of those made.
+        # The number of offered tasks, the live errors, and the messages of all errors.
         self.offers = 0
         self.errors: set[int] = set()
         self.messages: dict[int, tuple[int, str]] = {}
@@ -93,12 +93,12 @@ class Runtime:
         )
 
     def keep(self, task: Callable[[], None]) -> bool:
-        """Take a task, to be run by the test."""
+        """Accept a task, which the test will run."""
         self.tasks.append(task)
         return True
 
     def run_tasks(self) -> None:
-        """Run the tasks that were kept."""
+        """Run the stored tasks."""
         while self.tasks:
             self.tasks.pop()()
 

@@ -5,7 +5,7 @@ from scipy.integrate import solve_ivp
 
 
 def flow(velocity_field, y0, times, start=None):
-    """The solution of ẏ = f(t, y) at `times`, with y0 at `start` or at the first."""
+    """The solution of ẏ = f(t, y) at `times`; y0 holds at `start` or at the first."""
     solution = solve_ivp(
         velocity_field,
         (times[0] if start is None else start, times[-1]),

@@ -79,7 +79,7 @@ def in_rotation(constraint="none", in_time=False, retraction="cayley"):
     group = nhjax.SO3(RETRACTIONS[retraction])
     S = np.diag([0.3, 0.1, 0.5]) + 0.05
     level = float(ROTATION[2, 2])
-    # A turn about the vertical and one about e3 keep the angle between the two.
+    # Turns about the vertical and about e3 keep the angle between these axes.
     v = np.array([0.7, -0.4, 0.0])
     if constraint == "holonomic":
         v = 0.8 * ROTATION[2] - 0.5 * E3

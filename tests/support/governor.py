@@ -1,7 +1,7 @@
 """The flyball governor by Kane's equations in the frame that turns with its shaft.
 
-Vectors have the components (outward, ahead, up) of one rod. The couplers act as forces
-along themselves: those of rigid ones follow from d²/dt² of their lengths.
+Vectors have the components (outward, ahead, up) of one rod. Each coupler exerts a force
+along its line; for a rigid coupler, d²/dt² of its length gives this force.
 """
 
 from typing import NamedTuple
@@ -10,7 +10,7 @@ import numpy as np
 
 
 class Parameters(NamedTuple):
-    """As those of the example."""
+    """The parameters of the example."""
 
     shaft_inertia: float = 5e-6
     slider_inertia: float = 5e-3
@@ -34,7 +34,7 @@ def _rod(p, beta, spin, rate):
     for mass, reach in ((p.rod_mass, 0.5 * p.rod_length), (p.ball_mass, p.rod_length)):
         radius = p.arm + reach * cosine
         partial = np.array([[0, radius, 0], [-reach * sine, 0, -reach * cosine]])
-        # Centripetal parts in cylindrical coordinates, and the weight.
+        # Accelerations due to the rates, in cylindrical coordinates, and gravity.
         remainder = np.array(
             [
                 -reach * cosine * rate**2 - radius * spin**2,
@@ -55,7 +55,7 @@ def _rod(p, beta, spin, rate):
 
 
 def coupler(p, beta, s, rate, ds):
-    """Length d, its partials by β and s, rate ḋ, and d̈ without second derivatives."""
+    """Length d, its partials in β and s, rate ḋ, and d̈ without second derivatives."""
     half = 0.5 * p.rod_length
     x, z = half * np.cos(beta), p.height - half * np.sin(beta) - s
     dx, dz = -half * np.sin(beta) * rate, -half * np.cos(beta) * rate - ds
@@ -80,7 +80,7 @@ def free(p, q, v, torque):
 
 
 def _couplers(p, q, v):
-    """Lengths, their rates and bends, and the matrix of their partials."""
+    """For both couplers the matrix of partials, and d, ḋ and d̈ as in `coupler`."""
     rows, values = np.zeros((2, 4)), []
     for k in (1, 2):
         d, (rows[k - 1, k], rows[k - 1, 3]), change, bend = coupler(

@@ -1,4 +1,4 @@
-"""Gradients along one direction against differences."""
+"""Gradients along one direction, compared with differences."""
 
 import equinox as eqx
 import jax
@@ -17,9 +17,9 @@ STEPS = 200
 
 
 def assert_gradient(loss, given, epsilon=1e-4, rtol=1e-8):
-    """The gradient along one direction in all that is given, against differences."""
+    """Compare the gradient along one direction of `given` with differences."""
     program, along = jax.jit(jax.value_and_grad(loss)), direction(given)
-    # Of the types of all that is moved, not weaker ones: one program serves them all.
+    # `moved` by 0 makes the types as strong as below, so that one program suffices.
     _, gradient = program(moved(given, along, 0.0))
     expected = central_difference(
         lambda eps: program(moved(given, along, eps))[0], epsilon
@@ -29,9 +29,9 @@ def assert_gradient(loss, given, epsilon=1e-4, rtol=1e-8):
 
 
 def split(example):
-    """What an example is differentiated with respect to, and the way back.
+    """The variables to differentiate an example in, and a function that rebuilds it.
 
-    Its configuration moves in the chart around that of the example.
+    The configuration moves in the chart around that of the given example.
     """
     rest = eqx.tree_at(lambda e: e.q0, example, None)
     parameters, fixed = eqx.partition(rest, eqx.is_inexact_array)

@@ -1,4 +1,4 @@
-"""The gallery on groups and with holonomic constraints, at several data."""
+"""Gallery examples on groups or with holonomic constraints, for several data."""
 
 import jax
 import numpy as np
@@ -95,7 +95,7 @@ UNSOLVED = {
 }
 
 GALLERY = SOLVED | UNSOLVED
-# One of each class, where what is tested does not depend on the data.
+# One example of each class, for tests in which the data do not matter.
 KINDS = {type(example).__name__: example for example in reversed(GALLERY.values())}
 
 

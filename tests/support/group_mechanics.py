@@ -28,7 +28,7 @@ class MatrixGroup:
         return np.einsum("a,aij->ij", xi, self.basis)
 
     def vee(self, X) -> np.ndarray:
-        """The coordinates of matrices X of the algebra, any leading axes."""
+        """The coordinates of matrices X of the algebra, with any leading axes."""
         weights = np.einsum("aij,aij->a", self.basis, self.basis)
         return np.einsum("aij,...ij->...a", self.basis, X) / weights
 
@@ -55,7 +55,7 @@ class MatrixGroup:
     def _second(self, X, Y, Z):
         """The second derivative of τ at X along Y and each of the matrices Z.
 
-        With ε² = δ² = 0 the coefficient of εδ in τ(X + εY + δZ); ε and δ as matrices.
+        The coefficient of εδ in τ(X + εY + δZ) if ε² = δ² = 0; ε and δ are matrices.
         """
         size = len(X)
         if self.retraction == "exponential":
@@ -143,7 +143,7 @@ class Mechanics(abc.ABC):
         return np.zeros(len(self.inertia(g)))
 
     def phi(self, g, eta) -> np.ndarray:
-        """φ, shape (m,); unless overridden linear in η."""
+        """φ, shape (m,); linear in η unless overridden."""
         return self.d2phi(g, eta) @ eta
 
     def d2phi(self, g, eta) -> np.ndarray:
@@ -183,14 +183,14 @@ class Mechanics(abc.ABC):
         return self.d2phi(g, self.d2h(g, mu)) @ self.d2d2h(g, mu)
 
     def flat(self, g, mu, covectors) -> np.ndarray:
-        """♭_h of the rows, (D2D2h)^{-1} times each: vectors become covectors."""
+        """♭_h of each row, (D2D2h)^{-1} times it: vectors become covectors."""
         return np.linalg.solve(self.d2d2h(g, mu), covectors.T).T
 
     def acceleration(self, g, eta) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(η', λ, λ_hol) of the continuous equations, constraints differentiated.
+        """(η', λ, λ_hol) of the continuous equations with differentiated constraints.
 
         (D2ℓ)' = ad*_η D2ℓ + D1ℓ + λ D2φ + λ_hol DΦ, φ' = 0, (DΦ η)' = 0. The rates
-        along g' = g η at fixed η are complex steps, exact to round-off.
+        along g' = g η at fixed η come from complex steps, exact to round-off.
         """
         M, B, C = self.inertia(g), self.d2phi(g, eta), self.d_holonomic(g)
         force, direction = self.d1l(g, eta), eta
@@ -242,7 +242,8 @@ class Unicycle(Constant):
 class RigidBody(Constant):
     """On SO(3), U = Σ_ij C_ij R_ij.
 
-    Suslov's problem with one row; a heavy top with none and C = m g e3 Xᵀ.
+    With one row it is Suslov's problem; without rows and with C = m g e3 Xᵀ, a heavy
+    top.
     """
 
     C: np.ndarray

@@ -1,6 +1,6 @@
 """Motion on groups and with holonomic constraints, without the library's integrator.
 
-The index-reduced ODE, by SciPy, with brackets and tangents of the groups written out
+SciPy solves the index-reduced ODE; brackets and tangents of the groups are written out
 here.
 """
 
@@ -66,7 +66,7 @@ def coadjoint(group, eta, mu):
 
 
 def constraints_of(system, q, v):
-    """Nonholonomic constraints, tangency of the holonomic ones, and these."""
+    """Nonholonomic constraints, d/dt of the holonomic ones, and the holonomic ones."""
     values, tangency, positions = jnp.zeros(0), jnp.zeros(0), jnp.zeros(0)
     if system.nonholonomic is not None:
         values = jnp.atleast_1d(system.nonholonomic(0.0, q, v, None))

@@ -1,4 +1,4 @@
-"""Systems in both forms beside the oracle's description of them, and solved steps."""
+"""Systems in both forms and as the oracle describes them, and solved steps."""
 
 from collections.abc import Callable
 from functools import cache, partial
@@ -35,7 +35,7 @@ def both_forms(
     """L = ½ v·M v + A·v - U with M, A, U of (t, q), and its Legendre transform.
 
     The constraint and the force are given as functions of (t, q, v, args) for either
-    form; `inverse` is how M is inverted.
+    form; `inverse` inverts M.
     """
 
     def momentum_at_rest(t, q):
@@ -72,21 +72,21 @@ def both_forms(
 
 
 def inverse_of_three(matrix: Array) -> Array:
-    """The inverse of a 3 x 3 matrix, cheaper to differentiate and to compile."""
+    """The inverse of a 3 x 3 matrix, cheap to differentiate and to compile."""
     a, b, c = matrix.T
     rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])
     return rows / (a @ rows[0])
 
 
 class Problem(NamedTuple):
-    """A system in both forms, the same for the oracle, and a consistent state."""
+    """A system in both forms, its copy for the oracle, and a consistent state."""
 
     mechanics: by_hand.Mechanics
     forms: dict[str, nhjax.LagrangianSystem | nhjax.HamiltonianSystem]
     y0: State
 
     def element(self, q) -> np.ndarray:
-        """The oracle's element of a configuration."""
+        """The element of a configuration, as the oracle represents it."""
         if self.mechanics.group is None:
             return np.asarray(q)
         return np.asarray(self.forms["lagrangian"].manifold_of(q).matrix(q))
@@ -104,9 +104,9 @@ def _problem(
     phi=None,
     gamma=None,
 ) -> Problem:
-    """Functions of g, a matrix or on R^n a vector, and of v; v0 is made consistent.
+    """Create a problem from functions of v and g (a matrix, or on R^n a vector).
 
-    A constant inertia may be given as an array.
+    A constant inertia may be given as an array; v0 is made consistent.
     """
 
     def element(q):
@@ -144,7 +144,7 @@ QUATERNION = np.append(
 ROTATION = np.asarray(nhjax.SO3().matrix(jnp.asarray(QUATERNION)))
 INERTIA = np.array([[1.0, 0.1, 0.15], [0.1, 1.5, 0.25], [0.15, 0.25, 1.1]])
 TORQUE = np.array([[-0.5, -0.8, -0.1], [0.2, 0.2, -0.3], [0.1, 0.2, 0.7]])
-# Positive definite, and couples the six velocities of a body on SE(3).
+# A positive definite inertia that couples all six velocities of a body on SE(3).
 BODY = 1.5 * np.eye(6) + 0.2 * np.cos(np.add.outer(np.arange(6), np.arange(6)))
 
 

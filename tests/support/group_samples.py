@@ -28,8 +28,8 @@ SIMPLE = [group(r) for r in RETRACTIONS for group in (SO2, SO3, SE2, SE3)]
 MIXED = ProductGroup(SO3(), Euclidean(2), ProductGroup(SE2(Exponential()), SO2()))
 GROUPS = [*SIMPLE, Euclidean(3), MIXED]
 
-# Angles at zero, tiny, at each side of where a formula changes, and at the edge of the
-# chart. The series in θ² ends at 2; some functions are evaluated at θ²/4.
+# Angles: zero, tiny, on both sides of each change of formula, and at the edge of the
+# chart. The series in θ² is used up to 2; some functions are evaluated at θ²/4.
 SWITCHES = [sqrt(2), 2 * sqrt(2)]
 INSIDE = [0.0, 1e-12, 1e-8, 1e-4, 0.01, 0.3, 1.0, 3.0]
 INSIDE += [s * (1 + e) for s in SWITCHES for e in (-1e-9, 1e-9)]
@@ -76,7 +76,7 @@ def directions(group, like, seed):
 
 
 def elements(group, seed):
-    """Elements of the group anywhere, of translations of order one."""
+    """Elements anywhere in the group, with translations of order one."""
     xi, zeta = vectors(group, np.linspace(0, 2, 16), seed), vectors(group, 16 * [1.0])
     return _elements(group)(xi, zeta)
 
@@ -94,13 +94,13 @@ def distance(a, b):
 
 
 def batched(function):
-    # Compilation takes most of the time, and half as much without optimisation.
+    # Compilation takes most of the time; without optimisation it takes half as long.
     quick = {"xla_backend_optimization_level": 0}
     return jax.jit(jax.vmap(function), compiler_options=quick)
 
 
 def tau_of_matrix(group, X):
-    """τ by its definition on matrices; also of complex ones."""
+    """τ by its definition on matrices, which may be complex."""
     if isinstance(group.retraction, Exponential):
         return scipy.linalg.expm(X)
     identity = np.eye(len(X))
@@ -108,14 +108,14 @@ def tau_of_matrix(group, X):
 
 
 def seeded(test):
-    """The test with drawn directions, at every scale of `INSIDE` and the edge."""
+    """Run the test with random directions, at every scale of `INSIDE` and the edge."""
     drawn = hypothesis.given(seed=st.integers(0, 2**20))(test)
     return hypothesis.settings(max_examples=5, deadline=None)(drawn)
 
 
 @cache
 def compiled(group, *names):
-    """The composition of maps of a group by name, the last one first, over a batch."""
+    """The composition of named maps of a group over a batch; the last acts first."""
     *outer, inner = (getattr(group, name) for name in names)
 
     def composition(x, y):

@@ -15,7 +15,7 @@ from support.driven import ARGS, DRIVEN, driven_state
 CVT = systems.ContinuouslyVariableTransmission
 
 CLOSURES = ("propagated", "consistent", "symmetric")
-# A run that ends early is not compiled again, with Newton's method.
+# Without a fallback, a failed run does not compile Newton's method as well.
 SOLVERS = {
     "simplified": nhjax.SimplifiedNewton(fallback=False),
     "dense": nhjax.Newton(),
@@ -74,7 +74,7 @@ def _beside_friction(t, q, v, args):
     return jnp.concatenate([*rest, DRIVEN.friction(t, q, parts[-1], args)])
 
 
-# One program for five systems that do not know of one another: n = 19, m = 5.
+# One program for five uncoupled systems: n = 19, m = 5.
 SIDE_BY_SIDE = nhjax.LagrangianSystem(
     _beside_lagrangian, nonholonomic=_beside_constraint, force=_beside_friction
 )
@@ -87,7 +87,7 @@ def side_by_side_state():
 
 
 class SideBySide(eqx.Module):
-    """Examples that do not know of one another, as one program on a product."""
+    """Uncoupled examples as one system on a product manifold."""
 
     examples: tuple
 
@@ -97,7 +97,7 @@ class SideBySide(eqx.Module):
         return nhjax.ProductGroup(*(e.system.manifold_of(e.q0) for e in self.examples))
 
     def parts(self, x):
-        """What of the last axis of velocities or momenta belongs to each example."""
+        """Each example's part of the last axis of velocities or momenta."""
         ends = np.cumsum([example.v0.size for example in self.examples])
         return jnp.split(x, ends[:-1], axis=-1)
 
@@ -128,9 +128,9 @@ class SideBySide(eqx.Module):
         )
 
     def multipliers(self, x):
-        """What of the last axis of multipliers belongs to each example.
+        """Each example's part of the last axis of multipliers.
 
-        Those of all nonholonomic constraints come before those of the holonomic ones.
+        Multipliers of all nonholonomic constraints come before those of holonomic ones.
         """
         rows, end = [[] for _ in self.examples], 0
         for kind in ("nonholonomic", "holonomic"):
@@ -143,7 +143,7 @@ class SideBySide(eqx.Module):
         return [x[..., np.array(mine, int)] for mine in rows]
 
     def system(self, force=None):
-        """The system of all, with the kinds of constraints that occur."""
+        """The system of all examples, with the kinds of constraints that occur."""
         kinds = {
             kind: getattr(self, kind)
             for kind in ("nonholonomic", "holonomic")
@@ -154,7 +154,7 @@ class SideBySide(eqx.Module):
         )
 
     def initial_state(self, system, **others):
-        """The initial states of all."""
+        """The initial state of all examples together."""
         q = tuple(example.q0 for example in self.examples)
         v = jnp.concatenate([example.v0 for example in self.examples])
         return nhjax.initial_state(system, q, v, **others)
@@ -198,7 +198,7 @@ def recorded(name, stages, closure, solver):
 
 
 def direction(tree, seed=0):
-    """A random direction in the space of `tree`, each leaf by its own size."""
+    """A random direction in the space of `tree`, scaled by the size of each leaf."""
     rng = np.random.default_rng(seed)
 
     def leaf(x):

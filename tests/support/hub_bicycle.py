@@ -1,8 +1,8 @@
 """A bicycle in the coordinates of its rear hub, with both wheels held on the ground.
 
 q = (x, y, z, yaw, lean, pitch, steer, rear and front wheel angle): the rear hub and the
-angles of the rear frame R = R_z(yaw) R_x(lean) R_y(pitch), z upwards. That the wheels
-touch the ground are two holonomic constraints, that they roll four nonholonomic ones.
+angles of the rear frame R = R_z(yaw) R_x(lean) R_y(pitch), z upwards. The contact of
+the wheels gives two holonomic constraints, and their rolling four nonholonomic ones.
 """
 
 import jax
@@ -105,7 +105,7 @@ def make_system():
 
 
 def upright(lean, speed):
-    """Make a guess of a state that rolls straight on with a lean; to be projected."""
+    """Make a guess, to be projected, of a state that rolls straight on with a lean."""
     q = jnp.zeros(9).at[2].set(REAR_RADIUS * jnp.cos(lean)).at[4].set(lean)
     v = jnp.zeros(9).at[0].set(speed)
     v = v.at[7].set(speed / REAR_RADIUS).at[8].set(speed / FRONT_RADIUS)

@@ -12,10 +12,11 @@ from nhjax import Event, LobattoIIIAB
 
 
 class Rod(NamedTuple):
-    """A uniform rod of two tips that falls in a vertical plane onto the floor y = 0.
+    """A uniform rod with two tips that falls in a vertical plane onto the floor y = 0.
 
-    Its state is (x, y, θ) of the centre and its rates; a tip that touches the floor
-    gets a vertical impulse, by Newton's law with the coefficient of restitution.
+    Its state is (x, y, θ), with (x, y) the centre, and the rates; a tip that touches
+    the floor gets a vertical impulse, by Newton's law with the coefficient of
+    restitution.
     """
 
     mass: float = 1.3
@@ -28,7 +29,7 @@ class Rod(NamedTuple):
         return self.mass * self.half**2 / 3
 
     def flight(self, z, t):
-        """The state a time t after z, without a touch."""
+        """The state at a time t after z, without an impact."""
         q, v = z
         fall = np.array([0.0, -self.gravity, 0.0])
         return q + t * v + 0.5 * t**2 * fall, v + t * fall
@@ -76,7 +77,7 @@ class Rod(NamedTuple):
 
 
 class Latch(NamedTuple):
-    """Two rotors on a shaft, the first on a spring, which lock where they meet.
+    """Two rotors on a shaft, the first on a spring, which lock together when they meet.
 
     The first starts from rest at the angle -a, the second waits at the angle b.
     """
@@ -116,7 +117,7 @@ class Slide(NamedTuple):
 
     @property
     def time(self):
-        """The time until then, by the energy."""
+        """The time until the pressure vanishes, from the energy."""
 
         def slowness(x):
             fall = np.cos(self.angle) - np.cos(x)
@@ -131,7 +132,7 @@ START = np.array([0.2, 1.0, 0.4]), np.array([0.3, 0.2, 1.5])
 
 
 def turned(q, v, back=1.0):
-    """Turn a velocity in the plane between the body and space."""
+    """Turn a planar velocity from the body to space; with `back` = -1, the reverse."""
     c, s = jnp.cos(q[2]), back * jnp.sin(q[2])
     return jnp.stack([c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]])
 
@@ -165,7 +166,7 @@ def impact(tip, on_group=False):
 def rod_run(
     on_group, method, dt, num_steps, q, v, restitution, tips=(1, -1), **options
 ):
-    """Of the rod, in coordinates of the plane or on the group of its motions."""
+    """Run the rod, in coordinates of the plane or on the group of its motions."""
     system = rod_system(nhjax.SE2() if on_group else None)
     v = turned(q, v, -1.0) if on_group else v
     return nhjax.integrate(
@@ -181,7 +182,7 @@ def rod_run(
 
 
 def slide(stages, dt, gravity: Any = 1.0, closure="symmetric", **options: Any):
-    """Until the pressure of the sphere, its multiplier, changes sign."""
+    """Run the slide until the sphere's pressure, its multiplier, changes sign."""
     system = nhjax.LagrangianSystem(
         lambda t, q, v, args: 0.5 * v @ v - args * q[2],
         holonomic=lambda t, q, args: 0.5 * (q @ q - 1.0),

@@ -2,7 +2,7 @@
 
 WIDTH = 4
 
-# What is done for a member `%i`, from the addresses of arrays of float64.
+# The code for member `%i`, given the addresses of arrays of float64.
 TRIPLE = """
   %x_at = getelementptr double, ptr %x, i64 %i
   %value = load double, ptr %x_at
@@ -23,7 +23,7 @@ SHARED = """
   store double %sum, ptr %y_at
 """
 
-# Sleep for as many ms as the operand says, and tell how many threads were at it then.
+# Sleep for the operand's number of ms, and return how many threads were doing so.
 COUNT_THREADS = """
   %running = atomicrmw add ptr @running, i32 1 seq_cst
   %x_at = getelementptr double, ptr %x, i64 %i
@@ -41,7 +41,7 @@ RUNNING = "@running = internal global i32 0\ndeclare i32 @usleep(i32)\n"
 
 
 def kernel_ir(body: str, width: int = WIDTH, before: str = "") -> str:
-    """Return a kernel that does something for each of `width` members in turn."""
+    """Return a kernel that runs `body` for each of `width` members in turn."""
     return f"""
 {before}
 define i1 @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {{
@@ -64,7 +64,7 @@ end:
 """
 
 
-# A product of vectors, as kernels that are made for programs have them.
+# Products of vectors, as in the kernels that are generated for programs.
 VECTORS = """
 define i1 @kernel(ptr %operands, ptr %results, i64 %first, i64 %last) {
   %x = load ptr, ptr %operands

@@ -1,6 +1,6 @@
-"""Programs of their own that call native kernels: `python lane_processes.py NAME`.
+"""Separate programs that call native kernels: `python lane_processes.py NAME`.
 
-Each ends with a line that says what it has seen.
+Each prints its results in its last line.
 """
 
 import os
@@ -30,7 +30,7 @@ def called(body: str, before: str = ""):
 
 
 def cached(directory: str) -> None:
-    """Run a program that JAX keeps on disk, and tell whether it was found there."""
+    """Run a program that JAX caches on disk, and print how often it was found there."""
     jax.config.update("jax_compilation_cache_dir", directory)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
@@ -47,9 +47,8 @@ def cached(directory: str) -> None:
 def kept(directory: str, is_enabled: str, feature: str = "") -> None:
     """Compile a program for members and for a single run, with the cache on disk.
 
-    The machine of the keys has a feature of the processor more than this one, if given.
-    Tell how often LLVM was asked for the code of a program, and the results in
-    hexadecimal.
+    If a feature is given, the cache keys describe a processor that has it in addition.
+    Print how often LLVM generated code, and the results in hexadecimal.
     """
     from nhjax.lanes import _cache, _program
 
@@ -108,7 +107,7 @@ def saved(path: str) -> None:
 
 
 def loaded(path: str, is_registered: str) -> None:
-    """Load an executable, in a process that has registered its kernel or has not."""
+    """Load an executable, with or without registering its kernel first."""
     from jax.experimental import serialize_executable
 
     if is_registered == "registered":
@@ -129,8 +128,8 @@ def loaded(path: str, is_registered: str) -> None:
 def forked() -> None:
     """Call programs in a child, and compile there, while the parent compiles too.
 
-    In a child JAX itself runs what it has compiled, but it compiles no more, and does
-    not return from what it gives to other threads, such as copies of large arrays.
+    In a child, JAX itself can run compiled programs but not compile, and it hangs when
+    it gives work to other threads, such as copies of large arrays.
     """
     triple = jax.jit(called(TRIPLE))
     count = jax.jit(called(COUNT_THREADS, RUNNING))
@@ -140,7 +139,7 @@ def forked() -> None:
     is_over = threading.Event()
 
     def compile_on():
-        # The lock of the compiler is nearly always taken by this thread.
+        # This thread holds the lock of the compiler nearly all the time.
         for number in range(10_000):
             if is_over.is_set():
                 return
@@ -155,7 +154,7 @@ def forked() -> None:
         ended = 1
         try:
             np.testing.assert_array_equal(triple(x), 3 * x)
-            # Its blocks are long enough to ask for helpers, and none comes.
+            # The blocks are long enough to ask for helper threads, but none comes.
             np.testing.assert_array_equal(count(sleeps), 1.0)
             before = "@other = global i32 0\n"
             programs = lanes.compiled_code().programs
@@ -172,7 +171,7 @@ def forked() -> None:
 
 
 def threads(devices: str) -> None:
-    """Tell how many threads at most are in a kernel at once, of members that sleep."""
+    """Print the largest number of threads in a kernel at once; its members sleep."""
     mesh = jax.sharding.Mesh(np.array(jax.devices()), ("devices",))
     assert mesh.size == int(devices)
     spec = jax.sharding.PartitionSpec("devices")
@@ -209,7 +208,7 @@ def many_callers() -> None:
 
 
 def without_llvmlite() -> None:
-    """Import the package as where llvmlite is not installed."""
+    """Import the package as if llvmlite were not installed."""
     was_imported = "llvmlite" in sys.modules
     for name in [name for name in sys.modules if name.startswith("llvmlite")]:
         del sys.modules[name]

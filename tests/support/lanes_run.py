@@ -37,7 +37,7 @@ def compiled(text: str, level: int = 1) -> Any:
 def prepared(
     program: Any, is_batched: Sequence[bool], width: int, contract: bool = True
 ) -> tuple[Any, dict[str, float]]:
-    """Compile a closed jaxpr; return the kernel, and what that took."""
+    """Compile a closed jaxpr; return the kernel, the times, and the lines of IR."""
     start = time.process_time()
     text = llvm_ir(program, tuple(is_batched), width, contract=contract)
     middle = time.process_time()
@@ -82,7 +82,7 @@ def run(
 ) -> list[np.ndarray]:
     """Compute the results of a closed jaxpr for all members of a batch.
 
-    This happens on a thread of XLA, where subnormal numbers are taken as zero.
+    It runs on an XLA thread, where subnormal numbers are treated as zero.
     """
     kernel, _ = prepared(program, is_batched, width, contract)
     sizes = [len(x) for x, b in zip(operands, is_batched, strict=True) if b]
@@ -99,8 +99,8 @@ def run(
     return [np.asarray(x) for x in jax.block_until_ready(out)]
 
 
-# What runs next on a thread of XLA. A function of its own for every kernel would be
-# kept by JAX for ever.
+# The function that runs next on an XLA thread. JAX would keep a separate callback for
+# each kernel forever.
 _waiting: list[Any] = []
 
 
@@ -109,7 +109,7 @@ def _on_thread(*operands: Any) -> list[np.ndarray]:
 
 
 def run_batched(function: Any, width: int, *operands: Any, **options: Any) -> Any:
-    """Run a function of one member in lanes; every operand has the leading axis."""
+    """Run a function of one member in lanes; every operand has a leading batch axis."""
     firsts = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in operands]
     program, shapes = jax.make_jaxpr(function, return_shape=True)(*firsts)
     out = run(program, operands, [True] * len(operands), width, **options)

@@ -1,4 +1,4 @@
-"""What the tests of lanes share: samples, loops, and the comparison with JAX."""
+"""Shared by the tests of lanes: samples, loops, and the comparison with JAX."""
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ def count(most, seed=0):
 
 
 def repeated(times, body, x):
-    """A loop of a number of rounds that may differ between members."""
+    """A loop whose number of rounds may differ between members."""
 
     def step(state):
         k, x = state

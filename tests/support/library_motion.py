@@ -10,7 +10,7 @@ import nhjax
 
 def motion_at(system, t, q, v, args=None):
     """(v̇, λ) of `nhjax.motion`, for a Lagrangian system."""
-    # Neither the momentum nor the multiplier of the state plays a part.
+    # `nhjax.motion` uses neither the momentum nor the multiplier of the state.
     multiplier = jnp.zeros_like(system.constraint(jnp.asarray(t, v.dtype), q, v, args))
     y = nhjax.State(q, v, jnp.zeros_like(v), multiplier)
     motion = nhjax.motion(system, t, y, args)

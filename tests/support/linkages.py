@@ -1,7 +1,8 @@
 """Linkages with one degree of freedom in the angle of the crank.
 
 The closed loop is solved for the other angles by trigonometry, Kane's equation gives
-the acceleration of the crank, and Newton and Euler's give the force in the last joint.
+the acceleration of the crank, and the Newton-Euler equations give the force in the last
+joint.
 """
 
 from typing import NamedTuple
@@ -16,8 +17,8 @@ WEIGHT = np.array([0.0, -GRAVITY])
 class Body(NamedTuple):
     """A body while the crank moves at θ̇ with acceleration θ̈.
 
-    Its centre at c has the velocity w θ̇ and acceleration w θ̈ + b, its angular velocity
-    is k θ̇ and its angular acceleration k θ̈ + d.
+    Its centre at c has the velocity w θ̇ and acceleration w θ̈ + b; its angular
+    velocity is k θ̇, and its angular acceleration k θ̈ + d.
     """
 
     mass: float
@@ -77,7 +78,7 @@ def crank_acceleration(bodies, torque):
 
 
 def _bar(length, angle, rate, k, d):
-    """A bar's vector with its w and b, as those of a body."""
+    """A bar's vector with its w and b, as in `Body`."""
     bend = normal(angle) * d - unit(angle) * (k * rate) ** 2
     return length * np.stack([unit(angle), normal(angle) * k, bend])
 
@@ -103,7 +104,7 @@ class SliderCrank:
         return (
             Body(crank, bar_inertia(crank, r), 0.5 * pin, 1.0, 0.0),
             Body(rod, bar_inertia(rod, l), pin + 0.5 * arm, k, d),
-            # It rises and falls no more than rounding errors do.
+            # Its height is constant except for rounding errors.
             Body(slider, 0.0, pin + arm, 0.0, 0.0),
         )
 
@@ -133,7 +134,7 @@ class FourBar:
         self.lengths, self.masses, self.torque = lengths, masses, torque
 
     def angles(self, theta):
-        """Those of coupler and rocker, with their rates over that of the crank."""
+        """The angles of coupler and rocker, and their rates per rate of the crank."""
         l1, l2, l3, l4 = self.lengths
         # Freudenstein's equation for the rocker, by the half-angle.
         k1, k2 = l4 / l1, l4 / l3

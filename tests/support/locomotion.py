@@ -1,9 +1,10 @@
 """Snakeboard and roller racer by reduced equations.
 
-The snakeboard by its nonholonomic momentum equation ṗ = μ · ċ of Bloch, Krishnaprasad,
-Marsden and Murray (1996): p is the component of the body momentum μ along the one body
-velocity c(φ) that the axles permit. The roller racer by the Gibbs-Appell equations in
-the speed of the seat and the rate of the pivot. Forces follow from Newton's equations.
+The snakeboard uses the nonholonomic momentum equation ṗ = μ · ċ of Bloch,
+Krishnaprasad, Marsden and Murray (1996): p is the component of the body momentum μ
+along c(φ), the only body velocity that the axles permit. The roller racer uses the
+Gibbs-Appell equations in the speed of the seat and the rate of the pivot. Forces follow
+from Newton's equations.
 """
 
 import numpy as np
@@ -37,11 +38,11 @@ class Snakeboard:
         return c, dc
 
     def metric(self, c, spin):
-        """The mass of the speed, with the joints at rest."""
+        """The mass that belongs to the speed, with the joints at rest."""
         return self.m * (1 + c[1] ** 2) + (self.J + spin) * c[2] ** 2
 
     def speed(self, p, joints, rates):
-        """The speed s of the momentum p, with prescribed joints."""
+        """The speed s for the momentum p, with prescribed joints."""
         c, _ = self.permitted(joints, rates)
         return (p - c[2] * self.spins @ rates) / self.metric(c, self.spins.sum())
 
@@ -65,7 +66,7 @@ class Snakeboard:
         return load / self.metric(c, total)
 
     def free_acceleration(self, s, joints, rates, torques):
-        """(ṡ, ψ̈, φ̈_b, φ̈_f) under torques: the joints' momenta change by these alone."""
+        """(ṡ, ψ̈, φ̈_b, φ̈_f) under torques, which alone change the joints' momenta."""
         c, dc = self.permitted(joints, rates)
         load = (
             -s * (self.m * c[1] * dc[1] + self.J * c[2] * dc[2]) - c[2] * torques.sum()
@@ -107,7 +108,7 @@ class RollerRacer:
         return k, h, np.cos(phi) / reach + k * bend, h * bend
 
     def _kinematics(self, s, phi, rate):
-        """Rows for (θ̇, handlebar's speed, its turning): by s, by φ̇, and remainders."""
+        """θ̇; for θ̈ and the bar's accelerations, factors of ṡ and φ̈; remainders."""
         k, h, dk, dh = self.ratios(phi)
         turning = k * s + h * rate
         bend = (dk * s + dh * rate) * rate

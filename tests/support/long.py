@@ -1,7 +1,7 @@
-"""Cases of tests that are not among the quick ones.
+"""Test cases that do not belong to the quick ones.
 
-CI runs the long ones with `pytest -n 2 -m long`. Exhaustive ones are further members of
-products of cases; `pytest -n 2 -m exhaustive` runs them.
+CI runs the long ones with `pytest -n 2 -m long`. Exhaustive ones are the remaining
+combinations of parameters; `pytest -n 2 -m exhaustive` runs them.
 """
 
 from collections.abc import Iterable
@@ -11,25 +11,25 @@ import pytest
 
 
 def long(*case: Any, id: str | None = None) -> Any:
-    """A case of a test that takes long."""
+    """A test case that takes long."""
     return pytest.param(*case, id=id, marks=pytest.mark.long)
 
 
 def exhaustive(*case: Any) -> Any:
-    """A case of a test whose other cases take the same ways through the library."""
+    """A test case whose code paths in the library are also taken by other cases."""
     return pytest.param(*case, marks=pytest.mark.exhaustive)
 
 
 def exhaustive_but(short: Iterable[Any], cases: Iterable[Any]) -> list[Any]:
     """The cases, of which all but the short ones are exhaustive.
 
-    The short ones cover what the test is about: each kind of system or method that
-    takes another way through the library.
+    The short ones cover each kind of system or method that takes a different path
+    through the library.
     """
     cases, short = list(cases), list(short)
     missing = [case for case in short if case not in cases]
     assert not missing, f"no such cases: {missing}"
-    # A named tuple is one argument, a plain one holds several.
+    # A named tuple is one argument; a plain tuple holds several arguments.
     return [
         case
         if case in short

@@ -13,12 +13,12 @@ from support.orders import slopes
 
 
 class Runs(NamedTuple):
-    """All lanes take the steps of the finest one: coarse ones go on for longer."""
+    """A lane for each step size; all take as many steps as the finest."""
 
     counts: tuple[int, ...]
     ts: np.ndarray  # (lanes, steps)
     ys: nhjax.State
-    multiplier: np.ndarray  # that of the continuous equations
+    multiplier: np.ndarray  # of the continuous equations
     violation: np.ndarray  # the largest of each lane
 
     def until_the_duration(self, lane):
@@ -38,7 +38,7 @@ def _integrate(system, method, y0, dts, num_steps, args) -> Any:
             dt=dt,
             num_steps=num_steps,
             args=args,
-            throw=False,  # The assertion below tells.
+            throw=False,  # The assertion below reports failures.
             saveat=nhjax.SaveAt(steps=True),
         )
 
@@ -48,7 +48,7 @@ def _integrate(system, method, y0, dts, num_steps, args) -> Any:
 def runs(system, method, y0, counts, duration, args=None):
     """Run over the duration with N = counts[lane] steps.
 
-    The multiplier is found afterwards: inside of the run it would be traced with it.
+    The multiplier is computed afterwards, so that it is not traced with the run.
     """
     dts = jnp.asarray(duration, float) / jnp.asarray(counts, float)
     sol = _integrate(system, method, y0, dts, max(counts), args)
@@ -69,8 +69,8 @@ def runs(system, method, y0, counts, duration, args=None):
 def runs_of_three_stages(example, counts, duration):
     """The runs of an example, of order 4.
 
-    One number of stages shows whether a system is right, as its equations do not depend
-    on the method; orders of other numbers are tested in `tests/integrate`.
+    One number of stages suffices to test a system, since its equations do not depend on
+    the method; `tests/integrate` tests the orders for other numbers of stages.
     """
     method = nhjax.LobattoIIIAB(3)
     return runs(example.system, method, example.initial_state(), counts, duration)
@@ -79,8 +79,8 @@ def runs_of_three_stages(example, counts, duration):
 def assert_orders(runs: Runs, order: int, errors_at, floor: float, atol=0.3):
     """Check the slope of each error from each lane to the next.
 
-    `errors_at(t, y, multiplier)` maps nodes to a dictionary of errors by name, of which
-    the largest along the run counts.
+    `errors_at(t, y, multiplier)` maps nodes to a dictionary of errors by name, and the
+    largest along the run counts.
     """
     lanes = [errors_at(*runs.until_the_duration(k)) for k in range(len(runs.counts))]
     for name in lanes[0]:

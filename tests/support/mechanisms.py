@@ -1,4 +1,4 @@
-"""What tests of machines share: the motion by the library and by other equations."""
+"""Shared by tests of machines: the motion by the library and by other equations."""
 
 from functools import partial
 from typing import NamedTuple

@@ -11,7 +11,7 @@ NOTEBOOKS = {
     path.stem: path
     for path in sorted((Path(__file__).parents[2] / "notebooks").glob("*.ipynb"))
 }
-# Those whose results are compared with the truth.
+# Notebooks whose results are compared with the true values.
 FITS = {"fitting", "learning_potential", "rattleback", "steering_unicycle"}
 
 
@@ -25,7 +25,7 @@ def run_notebook(name: str, folder: Path) -> list:
     resources = {"metadata": {"path": str(folder)}}
     with pytest.MonkeyPatch.context() as environment:
         environment.setenv("NHJAX_SMALL", "1")
-        # Of the flags of the tests only that which saves a third of the time.
+        # Of the flags of the tests, keep only the one that saves a third of the time.
         environment.delenv("XLA_FLAGS", raising=False)
         environment.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
         # The kernel chooses the backend that puts figures into the notebook.

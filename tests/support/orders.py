@@ -24,7 +24,7 @@ def solver_for(stages):
 def runs_of_all_steps(
     system, method, y0, dts, num_steps, args, solver, invariants=None
 ):
-    """One lane for each dt, with the continuous multiplier beside the state."""
+    """One lane for each dt, with the continuous multiplier and the state."""
 
     def with_multiplier(t, y, args):
         return y, nhjax.continuous_multiplier(system, t, y, args)
@@ -39,7 +39,7 @@ def runs_of_all_steps(
             args=args,
             stage_solver=solver,
             invariants=invariants,
-            throw=False,  # Runs of few steps go on beyond the duration.
+            throw=False,  # Coarse runs go on beyond the duration.
             saveat=nhjax.SaveAt(steps=True, fn=with_multiplier),
         )
 
@@ -55,7 +55,7 @@ def trajectories(
         stage_solver = solver_for(method.stages)
     options = args, stage_solver, invariants
     sol = runs_of_all_steps(system, method, y0, dts, max(counts), *options)
-    # Each index into an array of JAX would be a program of its own.
+    # Each index into a JAX array would compile a separate program.
     ts, ys, failed = jax.tree.map(
         np.asarray, (sol.ts, sol.ys, sol.stats["failed_step"])
     )
@@ -86,9 +86,9 @@ def assert_order(order, counts, errors, floor=EXACT_FLOOR, tolerance=SLOPE_TOLER
 
 
 class Ladder(NamedTuple):
-    """The step sizes of runs of N steps each, and the nodes of a reference.
+    """The step sizes of runs with N steps each, and the nodes of a reference.
 
-    All lanes take as many steps, of which those up to the `duration` count; the
+    All lanes take the same number of steps; only those up to the `duration` count. The
     reference is known at multiples of the `finest` step.
     """
 
@@ -106,7 +106,7 @@ class Ladder(NamedTuple):
         return jax.tree.map(np.asarray, (sol.ts, *sol.ys))
 
     def assert_order(self, order, found, expected, floor=1e-11):
-        """Compare the order at which `found` comes near to what is `expected`."""
+        """Check the order at which `found` converges to `expected`."""
         counts, errors = [], []
         for lane, h in enumerate(self.step_sizes):
             count, stride = round(self.duration / h), round(h / self.finest)

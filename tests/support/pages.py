@@ -21,7 +21,7 @@ def page(name: str) -> str:
 
 
 def run_page(name: str) -> dict[str, Any]:
-    """Run the blocks of a page as printed; the names that they leave."""
+    """Run the blocks of a page as printed; return the names that they define."""
     namespace: dict[str, Any] = {"__name__": name}
     for block in blocks(page(name)):
         exec(compile(block, f"{name}.md", "exec"), namespace)
@@ -64,7 +64,7 @@ def rows_of(text: str, *headings: str) -> list[list[str]]:
 def assert_agree(printed: Any, measured: Any) -> None:
     """Each printed number is the measured one, rounded to the digits that are printed.
 
-    Zeros at the end of a whole number above 100 are not digits: 600 stands for 598.
+    Zeros at the end of a whole number above 100 are not digits: 600 may mean 598.
     """
     for text, value in zip(printed, measured, strict=True):
         mantissa, _, exponent = text.partition("e")

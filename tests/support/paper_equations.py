@@ -57,7 +57,7 @@ def _lobatto_nodes(stages):
 
 @cache
 def lobatto(stages: int) -> Pair:
-    """The pair with `stages` stages, each half from its own definition.
+    """The pair with `stages` stages, each method from its own definition.
 
     IIIA is collocation at the Lobatto nodes. IIIB is discontinuous collocation: with
     u' = Σ f_j l_j over the inner nodes and u(0) = y_0 - h b_1 (u'(0) - f_1) its stages
@@ -100,7 +100,8 @@ class Run:
 def _relative(*terms, total=None):
     """The largest |Σ terms| over all points, relative to the largest Σ |terms| there.
 
-    The maximum norm over the components of an equation; `total` replaces the size.
+    The norm is the maximum over the components of an equation; `total` replaces Σ
+    |terms|.
     """
     residual = np.max(np.abs(sum(terms)), axis=-1)
     if total is None:
@@ -110,11 +111,11 @@ def _relative(*terms, total=None):
 
 
 def residuals(mechanics: Mechanics, run: Run, closure: str) -> dict[str, float]:
-    """How well each equation of the paper's summary holds, equation by equation.
+    """How well each equation of the paper's summary holds.
 
-    In the order of the summary, with the definitions Q^i, P^i, q^i, p^i of the stages
-    substituted into the equations that they enter; then the closure of the multipliers.
-    The velocities v^i are those of the momenta p^i, not the library's; Φ is measured by
+    The order is that of the summary; the closure of the multipliers comes last. The
+    definitions Q^i, P^i, q^i, p^i of the stages are substituted. The velocities v^i are
+    computed from the momenta p^i, not taken from the library. Φ is relative to
     Σ_j |D2Φ_j| max |v|, since the components of v come out of one linear system.
     """
     stages = run.V.shape[1]

@@ -2,7 +2,7 @@
 
 An oracle that shares no code with the library, for the groups and systems of
 `group_mechanics`. Every equation of the paper's summaries is evaluated as a residual,
-as printed but for one erratum (see `hamiltonian_group_residuals`).
+as printed except for one erratum (see `hamiltonian_group_residuals`).
 
 Conventions: D1 is left-trivialised, <D1ℓ, δ> = d/dε ℓ(g τ(εδ), η). A covector is the
 array of its values on the basis, so that the dual of a map is the transpose of its
@@ -71,14 +71,14 @@ class Stages:
 
 @dataclass(frozen=True)
 class LagrangianStages(Stages):
-    """With the node velocities η^i, on a vector space v^i."""
+    """With the node velocities η^i (v^i on a vector space)."""
 
     eta_nodes: np.ndarray  # (s, n)
 
 
 @dataclass(frozen=True)
 class HamiltonianStages(Stages):
-    """With the stage momenta Π^i, on a vector space P^i; see `chart_momenta`."""
+    """With the stage momenta Π^i (P^i on a vector space); see `chart_momenta`."""
 
     Pi: np.ndarray  # (s, n)
 
@@ -108,7 +108,7 @@ class Residuals(dict[str, np.ndarray]):
 
 
 def _constraints(found, mechanics: Mechanics, name, G, velocities, values):
-    """φ or ψ at the nodes, relative to |D2φ| |η| and the part that η does not enter."""
+    """φ or ψ at the nodes, relative to |D2φ| |η| plus the part without η."""
     slopes = rows(mechanics.d2phi, G, velocities)
     rest = rows(mechanics.phi, G, np.zeros_like(velocities))
     speed = np.max(np.abs(velocities))
@@ -143,7 +143,7 @@ def _hamiltonian_force(mechanics: Mechanics, G, mu, stages: Stages):
 def chart_momenta(
     mechanics: Mechanics, tableau: Tableau, h, H, mu_hat, chart: str
 ) -> np.ndarray:
-    """Π^i = (dτ_yi)* of the body momenta μ^i of the stages; those of h at (G^i, ·)."""
+    """Π^i = (dτ_yi)* μ^i for the body momenta μ^i; h is evaluated at (G^i, μ^i)."""
     if mechanics.group is None:
         return mu_hat
     y = CHARTS[chart].coordinates(tableau, h, H)
@@ -161,9 +161,9 @@ def lagrangian_group_residuals(
 ) -> Residuals:
     """Summary "Discrete nonholonomic Lagrangian equations. Lie group".
 
-    These are the paper's for the chart at the start. With N^i + T^i of the section
-    "Holonomic constraints" in place of N^i, Φ(G^i) = 0 and the tangency condition.
-    μ^i = D2ℓ(g_k τ(ξ^i), η^i) is substituted.
+    For the chart at the start, these are the paper's. Holonomic constraints replace N^i
+    by N^i + T^i (section "Holonomic constraints") and add Φ(G^i) = 0 and the tangency
+    condition. μ^i = D2ℓ(g_k τ(ξ^i), η^i) is substituted.
     """
     assert mechanics.group is not None
     at = CHARTS[chart](mechanics.group, tableau, h, g, stages.H)
@@ -198,7 +198,7 @@ def hamiltonian_group_residuals(
     """Summary "Discrete nonholonomic Hamiltonian equations. Lie group".
 
     Erratum: its last line reads H^i = (dτ_Ξ)* D2h, which maps duals; it must be
-    H^i = dτ_Ξ^{-1} D2h. Holonomic constraints as on the Lagrangian side.
+    H^i = dτ_Ξ^{-1} D2h. Holonomic constraints enter as on the Lagrangian side.
     """
     assert mechanics.group is not None
     at = CHARTS[chart](mechanics.group, tableau, h, g, stages.H)
@@ -262,7 +262,7 @@ def hamiltonian_residuals(
     """Summary "Discrete nonholonomic Hamiltonian equations. Vector space".
 
     W^i here has the sign of the Lagrangian side, minus the printed one. Holonomic
-    constraints as there.
+    constraints enter as on that side.
     """
     found = Residuals()
     Q = q + h * (tableau.a @ stages.H)

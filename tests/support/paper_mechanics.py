@@ -361,7 +361,7 @@ class Driven(Mechanics):
 
 
 class SideBySide(Mechanics):
-    """Several systems that do not know of one another, as one."""
+    """Several uncoupled systems, as one."""
 
     def __init__(self, parts: list[tuple[Mechanics, int]]):
         self.parts = [part for part, _ in parts]

@@ -14,7 +14,7 @@ STEPS, DT = 20, 0.1
 
 
 def run(**others: Any) -> nhjax.Solution:
-    """Integrate the particle, with other arguments in place of the usual ones."""
+    """Integrate the particle; `others` replace the usual arguments."""
     arguments: dict[str, Any] = {
         "system": PARTICLE.system,
         "method": nhjax.LobattoIIIAB(3),

@@ -126,7 +126,7 @@ def bits(tree: Any) -> str:
 def summary(folder: Path) -> dict[str, Any]:
     """Return the results that do not depend on the number of processes."""
     kept = statistics(folder / "kept")
-    # The blocks of the exchange do not end where the share of a process ends.
+    # With this size, no block of the exchange ends where a process's share ends.
     with mock.patch.object(_sinks, "_BLOCK", 80):
         values = nhjax.ensemble(judged, MEMBERS, chunk_size=2).values
     assert kept.failures() == statistics().failures()

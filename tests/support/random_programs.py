@@ -19,7 +19,7 @@ from support.random_steps import (
 
 
 class Programs(Steps):
-    """What makes a program, step by step, with loops and branches."""
+    """Makes a program, step by step, with loops and branches."""
 
     def grow(self, count: int) -> list[Step]:
         """Append a number of steps."""
@@ -50,13 +50,13 @@ class Programs(Steps):
     # Loops and branches, whose bodies use all earlier arrays
 
     def inner(self, own: list[Kind], outs: list[Kind]) -> Callable[..., list[Any]]:
-        """Make a function of earlier arrays and of its own that makes certain kinds."""
+        """Make a function of earlier and own arrays, with results of given kinds."""
         inside = Programs(self.draw, [*self.kinds, *own], self.depth - 1)
         steps = inside.grow(self.draw(st.integers(1, 4)))
         places = []
         for position, kind in enumerate(outs):
             found = [i for i, k in enumerate(inside.kinds) if k == kind]
-            # What was made last is the most interesting, and the first choice.
+            # The last array is the most interesting, so it is the first choice.
             default = [len(self.kinds) + position]
             places.append(inside.choose([*reversed(found), *default]))
 
@@ -109,7 +109,7 @@ class Programs(Steps):
 
         def scan(*values):
             outer, carry, xs = values[:size], values[size:-1], values[-1]
-            # More rounds than are unrolled, at times.
+            # Sometimes there are more rounds than are unrolled.
             xs = jnp.concatenate([xs] * repeats)
 
             def step(carry, x):
@@ -132,7 +132,7 @@ class Programs(Steps):
 
         def branch(*values):
             outer, own = values[:size], values[size:-1]
-            # `jax.vmap` makes a selection of a branch, but `lax.switch` stays one.
+            # `jax.vmap` turns this branch into a selection, but not `lax.switch`.
             return tuple(
                 lax.cond(
                     values[-1],
@@ -149,7 +149,7 @@ def programs(draw: Callable) -> tuple[list[Kind], list[Step]]:
     """Make the kinds of the operands of a program, and its steps."""
     kind = st.builds(Kind, st.sampled_from(DTYPES), st.sampled_from(SHAPES))
     kinds = draw(st.lists(kind, min_size=2, max_size=4))
-    # Without an index and a predicate little can happen.
+    # Without an index and a predicate few steps are possible.
     kinds += [Kind(draw(st.sampled_from(INTEGERS[:3])), ()), Kind("bool", ())]
     made = Programs(draw, kinds, depth=2)
     return kinds, made.grow(draw(st.integers(1, 8)))

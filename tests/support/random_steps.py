@@ -1,8 +1,8 @@
 """Steps of random programs over the primitives that lanes support, and data.
 
 A program is a list of steps. Each makes an array from earlier ones; the steps of loops
-and branches have lists of steps of their own. What is not exact in every order of
-summation, or differs between libraries, is avoided: sums are of small whole numbers.
+and branches have lists of steps of their own. To avoid results that depend on the order
+of summation or on the library, only small whole numbers are added.
 """
 
 from collections.abc import Callable
@@ -46,7 +46,7 @@ def evaluate(steps: list[Step], values: list[Any]) -> list[Any]:
 
 
 def numbers(kind: Kind, members: int, seed: int) -> np.ndarray:
-    """Draw data, with everything that is special about a dtype."""
+    """Draw data, including all special values of a dtype."""
     rng = np.random.default_rng(seed)
     shape = (members, *kind.shape)
     if kind.dtype == "bool":
@@ -91,7 +91,7 @@ _COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
 
 
 def whole(x: Any) -> Any:
-    """Bring numbers to a few whole ones, whose sums and products are exact."""
+    """Map numbers to a few whole numbers, whose sums and products are exact."""
     if x.dtype == bool:
         return x
     low, high = (
@@ -102,7 +102,7 @@ def whole(x: Any) -> Any:
 
 
 class Steps:
-    """What appends steps to a program, from choices of hypothesis."""
+    """Appends steps, which hypothesis chooses, to a program."""
 
     def __init__(self, draw: Callable, kinds: list[Kind], depth: int):
         self.draw, self.depth = draw, depth
@@ -118,7 +118,7 @@ class Steps:
         return self.draw(st.sampled_from(list(options)))
 
     def find(self, test: Callable[[Kind], bool]) -> int | None:
-        """Choose an array of a kind; the last ones come first when this is shrunk."""
+        """Choose an array of a kind; shrinking prefers the last ones."""
         found = [i for i, kind in enumerate(self.kinds) if test(kind)]
         return self.choose(found) if found else None
 
@@ -132,8 +132,8 @@ class Steps:
 
     def stretched(self) -> None:
         """Append an operation on arrays that have axes of length one."""
-        # XLA divides by what it broadcasts as if by multiplying with the reciprocal: in
-        # float32 its results are up to 1 ulp from those of IEEE 754, which lanes give.
+        # To divide by a broadcast array, XLA multiplies by the reciprocal: in float32
+        # its results differ by up to 1 ulp from IEEE 754, which lanes follow.
         name = self.choose([name for name in _BINARY if name != "div"])
         dtypes = _BINARY[name]
         first = self.find(lambda k: k.shape == (2, 3) and k.dtype in dtypes)
@@ -191,7 +191,7 @@ class Steps:
             high = self.find(lambda other: other == kind)
 
             def clamp(*values):
-                # With scalars `jax.vmap` fails if the limits alone have members.
+                # With scalars, `jax.vmap` fails if only the limits are batched.
                 out = lax.clamp(*[jnp.reshape(x, (-1,)) for x in values])
                 return jnp.reshape(out, kind.shape)
 
@@ -200,8 +200,8 @@ class Steps:
     def convert(self) -> None:
         source = self.find(lambda kind: True)
         kind = self.kinds[source]  # pyright: ignore[reportArgumentType, reportCallIssue]
-        # Not the other way round: XLA takes subnormal numbers as zero where it computes
-        # with them, and leaves them where it moves them.
+        # Not from integers to floats: XLA treats subnormal numbers as zero when it
+        # computes, but keeps them when it copies.
         pairs = {"float32": "int32", "float64": "int64"}
         if kind.dtype in pairs and self.draw(st.booleans()):
             dtype = pairs[kind.dtype]

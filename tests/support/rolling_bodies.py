@@ -1,6 +1,6 @@
 """Rigid bodies that roll on a horizontal plane, by Newton and Euler in body axes.
 
-Forces are eliminated by hand: a body is (R, ω, x, y), with the attitude as a matrix,
+Forces are eliminated by hand. The state is (R, ω, x, y), with the attitude as a matrix,
 the body angular velocity and the point of contact. γ = Rᵀ e₃ is the upward vertical in
 the body, and s the contact as seen from the centre of mass. In NumPy alone.
 """
@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 
 def cross(x, y):
-    """The product x × y; that of NumPy takes ten times as long for one pair."""
+    """The product x × y; `np.cross` takes ten times as long for one pair."""
     a, b, c = x
     d, e, f = y
     return np.array([b * f - c * e, c * d - a * f, a * e - b * d])
@@ -38,14 +38,14 @@ class RollingBody:
     def accelerations(self, R, omega):
         """(v̇, ω̇, F) of the body velocities, with the force F of the plane in space.
 
-        Of m (v̇ + ω × v + g γ) = F and J ω̇ + ω × J ω = s × F - σ ω with v = -ω × s.
+        From m (v̇ + ω × v + g γ) = F and J ω̇ + ω × J ω = s × F - σ ω with v = -ω × s.
         """
         J, m = self.inertia, self.mass
         up = R[2]
         s, slope = self.shape(up)
         s_dot = slope @ cross(up, omega)
         v = -cross(omega, s)
-        # What is in v̇ + ω × v + g γ beside -ω̇ × s.
+        # v̇ + ω × v + g γ without its term -ω̇ × s.
         known = -cross(omega, s_dot) + cross(omega, v) + self.gravity * up
         torque = -cross(omega, J @ omega) - self.damping * omega
         matrix = J - m * hat(s) @ hat(s)
@@ -64,7 +64,7 @@ class RollingBody:
         def field(_, y):
             R, omega = y[:9].reshape(3, 3), y[9:12]
             _, slope = self.shape(R[2])
-            # The contact moves by what the body turns under it.
+            # The body rolls, so the contact moves at the velocity R ṡ.
             path = R @ slope @ cross(R[2], omega)
             _, omega_dot, _ = self.accelerations(R, omega)
             return np.concatenate([(R @ hat(omega)).ravel(), omega_dot, path[:2]])
@@ -110,7 +110,7 @@ def sphere(radius, centre):
 
 
 def torus(radius, tube_radius):
-    """The shape of a torus about the third axis; `radius` is that of its core."""
+    """The shape of a torus about the third axis; `radius` is the radius of its core."""
 
     def shape(up):
         across = np.array([up[0], up[1], 0.0])
@@ -220,7 +220,7 @@ def random_states(number, seed=0, tilt=0.6, rates=2.0):
 
 
 def pose_and_twist(body, quaternion, omega, contact):
-    """(q, v) on SE(3) as in the library, by the constraints."""
+    """(q, v) on SE(3) as in the library, with v from the constraints."""
     R = matrix_of(quaternion)
     v = -cross(omega, body.shape(R[2])[0])
     q = np.append(quaternion, body.centre(R, contact))
@@ -228,7 +228,7 @@ def pose_and_twist(body, quaternion, omega, contact):
 
 
 def errors_of(body, start, duration, finest):
-    """What maps nodes of a run on SE(3) to their errors; `start` is (quaternion, ω).
+    """Return a function from nodes on SE(3) to errors; `start` is (quaternion, ω).
 
     The reference is taken at the nodes of the finest run, with `finest` steps.
     """

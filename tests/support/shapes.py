@@ -9,18 +9,18 @@ from beartype import beartype, BeartypeConf
 from beartype.roar import BeartypeDecorHintException
 
 
-# An int is a float, as type checkers have it.
+# An int counts as a float, as for type checkers.
 _checked = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
 
-# They transform programs and write native code.
+# These rooms transform programs and write native code.
 WITHOUT_SHAPES = ("nhjax._compile", "nhjax.lanes")
 
 
 def checked(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function with its annotations checked, where the checker knows their kind.
+    """The function with its annotations checked, if the checker supports them.
 
-    It knows no generic named tuples.
+    It does not support generic named tuples.
     """
     try:
         return _checked(function)
@@ -29,7 +29,7 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def rooms_with_shapes() -> list[str]:
-    """All rooms but the two that transform programs: no shapes, and many calls."""
+    """All rooms but WITHOUT_SHAPES, which have no shapes and make many calls."""
     package = find_spec("nhjax")
     assert package is not None
     rooms = pkgutil.iter_modules(package.submodule_search_locations, "nhjax.")

@@ -1,7 +1,7 @@
 """The spatial slider-crank in the angle of its crank, by Kane's equation.
 
 The connecting rod turns about the slider's axis and about a second axis across both, as
-the universal joint at the slider lets it. Newton's and Euler's equations of the rod and
+the universal joint at the slider allows. Newton's and Euler's equations of the rod and
 the slider give the force in the spherical joint.
 """
 
@@ -14,7 +14,7 @@ X = np.array([1.0, 0.0, 0.0])
 class SpatialSliderCrank:
     """Crank r about the axle at (0, y, z), rod l, slider along the x-axis.
 
-    `inertias` are those of crank, of rod along and across its axis.
+    `inertias` belong to the crank, and to the rod along and across its axis.
     """
 
     def __init__(self, r, l, axle, inertias, masses, gravity, centre=0.0):
@@ -24,7 +24,7 @@ class SpatialSliderCrank:
         self.weight, self.centre = np.array([0.0, 0.0, -gravity]), centre
 
     def _motions(self, theta, rate):
-        """Rows (place, w, b) of pin and slider, velocity w θ̇, acceleration w θ̈ + b."""
+        """(place, w, b) of pin and slider: velocity w θ̇, acceleration w θ̈ + b."""
         sine, cosine = np.sin(theta), np.cos(theta)
         arm = self.r * np.array([0.0, -sine, cosine])
         pin = [
@@ -42,7 +42,7 @@ class SpatialSliderCrank:
     def _rod(self, theta, rate):
         """Axis e, second joint axis n, ω = k θ̇ and ω̇ = k θ̈ + d of the rod.
 
-        Last the two parts of k, about the x-axis and about n, with their remainders.
+        Then the two parts of k, about the x-axis and about n, with their remainders.
         """
         pin, slider = self._motions(theta, rate)
         e, w, b = (slider - pin) / self.l

@@ -1,6 +1,6 @@
 """Classical tableaux, and defects of order conditions in exact rational arithmetic.
 
-Of the float64 coefficients, so that the only error in them is their own rounding.
+They are defects of the float64 coefficients, whose rounding is their only error.
 """
 
 from collections.abc import Callable

@@ -17,12 +17,12 @@ from nhjax.lanes._writer import symbol
 from support.native_lanes import Native
 
 
-# Numbers of mpmath, whose class is an attribute of a context before mpmath 1.4.
+# Numbers of mpmath; before mpmath 1.4 their class is an attribute of a context.
 Real = Any
 
 
 BINARY = ("atan2", "pow", "rem")
-# Digits for which all that cancels in the formulas below does not matter.
+# With so many bits, cancellation in the formulas below does not matter.
 BITS = 300
 
 _REFERENCES: dict[str, Callable[..., Real]] = {
@@ -35,7 +35,7 @@ _REFERENCES: dict[str, Callable[..., Real]] = {
 
 
 def reference(op: str, *arguments: float) -> Real:
-    """Return what a function is, to many digits."""
+    """Return the value of a function, to many digits."""
     function = _REFERENCES.get(op) or getattr(mpmath, op)
     # Products of powers of 2 may be of any size in mpmath.
     return function(*map(mpf, arguments))
@@ -64,7 +64,7 @@ def _everywhere(rng: np.random.Generator, count: int, dtype: type) -> np.ndarray
 
 
 def _powers(rng: np.random.Generator, count: int, low: float, high: float):
-    """Draw numbers of both signs whose logarithms to base 2 are spread evenly."""
+    """Draw numbers of both signs with uniformly distributed logarithms to base 2."""
     return rng.choice([-1.0, 1.0], count) * 2.0 ** rng.uniform(low, high, count)
 
 
@@ -146,7 +146,7 @@ def _of_two(op: str, rng: np.random.Generator, count: int, dtype: type):
 def arguments(op: str, seed: int, count: int, dtype: type) -> list[np.ndarray]:
     """Draw arguments from all of a function's domain but zeros and infinities.
 
-    They are mixed, so that usual and unusual ones are in lanes of the same vectors.
+    They are mixed, so that usual and unusual ones share vectors.
     """
     rng = np.random.default_rng(seed)
     with np.errstate(all="ignore"):

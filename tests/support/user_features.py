@@ -1,4 +1,4 @@
-"""What features as users run them have in common: their register, and short runs."""
+"""Shared by the features as users run them: their register, and short runs."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,6 +1,6 @@
 """Run every feature as users do, with annotations of shapes checked.
 
-A program: `python -m support.with_shapes` in `tests`.
+Run `python -m support.with_shapes` in `tests`.
 """
 
 import runpy
@@ -11,6 +11,6 @@ from support import shapes
 
 
 if __name__ == "__main__":
-    # Before anything of nhjax is imported.
+    # This must precede every import of nhjax.
     with install_import_hook(shapes.rooms_with_shapes(), "support.shapes.checked"):
         runpy.run_module("support.as_users_run", run_name="__main__")

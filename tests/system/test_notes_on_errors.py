@@ -18,7 +18,7 @@ Q, V = jnp.array([0.0, 1.0]), jnp.array([1.0, 0.0])
 QUATERNION = jnp.array([1.0, 0.0, 0.0, 0.0])
 
 
-# Each takes (t, q, v, args), of which a function uses what it has.
+# Each takes (t, q, v, args); a function of the system passes what it receives.
 def by_numpy(t, q, v, args):
     return np.sin(q[0])
 

@@ -85,7 +85,7 @@ def test_squeezer_initial_values_equal_published_ones():
 def test_run_ends_at_the_published_solution(lanes):
     stages, found = lanes
     if stages == 2:
-        # Its error is 1e-4.
+        # The error of this run is 1e-4.
         np.testing.assert_allclose(found.lanes[-1].q[-1], PUBLISHED_Q, rtol=2e-4)
         return
     # The published numbers have errors of 1e-10 in the angles, 5e-8 in the velocities
@@ -97,7 +97,7 @@ def test_run_ends_at_the_published_solution(lanes):
 
 
 def test_published_solution_has_nine_digits(reference):
-    # Its velocities violate the differentiated constraints, those of the run do not.
+    # The published velocities violate the differentiated constraints; ours do not.
     violation = andrews.jacobian(PUBLISHED_Q) @ PUBLISHED_V
     assert 5e-10 < np.max(np.abs(violation)) < 2e-9
     own = andrews.jacobian(reference["q"]) @ reference["v"]

@@ -102,7 +102,7 @@ def test_accelerations_and_forces_equal_newton_euler(ball):
         x, w, R = start_of(one)
         np.testing.assert_allclose(one.v0[3:], oracle.velocity(x, w), atol=1e-14)
         x_ddot, w_dot, force = oracle.accelerations(x, w)
-        # The body angular velocity has the rates of that in space, seen in the body.
+        # The body angular velocity changes as the one in space, seen in the body.
         expected = np.concatenate([R.T @ w_dot, x_ddot])
         scale = np.max(np.abs(expected))
         np.testing.assert_allclose(slope[k] / scale, expected / scale, atol=1e-11)
@@ -139,7 +139,7 @@ def test_run_converges_with_method_order(found):
 @pytest.mark.long
 def test_constraints_hold_to_round_off_and_moving_energy_is_conserved(found):
     ball = BALLS["paraboloid"]
-    # Of 2 J; the coarsest runs take four times the duration.
+    # Drifts of an energy of 2 J; the coarsest runs take four times the duration.
     largest = (2e-6, 1e-7, 6e-9)
     assert np.max(found.violation) < 1e-13
     drift = drifts(ball, found)["moving_energy"]
@@ -197,7 +197,7 @@ def test_accelerations_on_steady_circle_are_exact(ball):
     rate = float(ball.v0[4] / ball.q0[1][0])
     q, v = stack([(ball.q0, ball.v0)])
     slope, _, _ = accelerations(ball.system, q, v)
-    # All turns about the vertical: the angular velocity is seen from the body.
+    # Everything turns about the vertical; ω is seen from the body.
     spinning = np.cross(rate * UP, start_of(ball)[1])
     expected = start_of(ball)[2].T @ spinning
     moving = np.cross(rate * UP, ball.v0[3:])
@@ -224,7 +224,7 @@ def test_ball_on_small_circle_has_frequency_of_oscillations(shape):
     frequency = 2.1
     ball = BallInBowl.circling(1e-5, frequency, shape=shape)
     spin = start_of(ball)[1][2]
-    # Of (1 + k) ζ'' - i k (Ω (1 + κ a) - κ a w₃) ζ' + g κ ζ = 0 for ζ = x + iy.
+    # From (1 + k) ζ'' - i k (Ω (1 + κ a) - κ a w₃) ζ' + g κ ζ = 0 for ζ = x + iy.
     terms = [1 + k, -k * (rate * (1 + kappa * a) - kappa * a * spin), -g * kappa]
     size = (1 + k) * frequency**2
     assert np.polyval(terms, frequency) == pytest.approx(0.0, abs=1e-8 * size)
@@ -234,7 +234,7 @@ def test_bowl_points_are_on_the_ball_and_on_the_bowl():
     ball = BALLS["paraboloid"]
     points = ball.points(0.0, ball.q0)
     assert set(points) == {"centre", "contact", "pole"}
-    # Where the slope is 3/4.
+    # The bowl has the slope 3/4 there.
     np.testing.assert_allclose(points["contact"], [0.56, 0, 0.1075], atol=1e-16)
     np.testing.assert_allclose(points["pole"], [0.5, 0, 0.2875], atol=1e-16)
 

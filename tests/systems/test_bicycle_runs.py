@@ -45,8 +45,8 @@ def test_rider_with_default_gains_stabilises_slow_bicycle():
     assert np.max(np.linalg.eigvals(free).real) > 2
 
 
-# The run of the library of benchmarks of IFToMM: 5 s from 4.6 m/s with a lean rate of
-# 0.5 rad/s, and its half with half of the step; with two stages a rider steers.
+# The run of the IFToMM benchmark library, 5 s from 4.6 m/s with a lean rate of 0.5
+# rad/s, and its first half with half of the step. With two stages a rider steers.
 BICYCLES = {2: WhippleBicycle(steering=STEERED), 3: WhippleBicycle()}
 DURATION, FINEST = 2.5, 0.0025
 LADDERS = {
@@ -124,7 +124,7 @@ def test_constraints_in_a_run_of_five_seconds_hold(stages):
 @pytest.mark.long
 def test_energy_in_a_run_of_five_seconds_is_conserved():
     energy, _, _, start = checks(3)
-    # The library of benchmarks allows 1e-5.
+    # The benchmark library allows 1e-5.
     assert np.max(np.abs(energy / start - 1)) < 5e-7
 
 

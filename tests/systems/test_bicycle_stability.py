@@ -34,9 +34,8 @@ def test_linear_equations_of_the_oracle_equal_published_ones():
 def multipliers():
     """A function (speeds, step sizes) -> eigenvalues of the linearised step.
 
-    Lean, steer and their rates make a consistent state, a step follows, and its
-    derivative is that of the same four numbers at its end. The mode exp(λ h) has the
-    logarithm λ h.
+    Lean, steer and their rates determine a consistent state. A step maps these four
+    numbers to the same numbers at its end; its derivative has the eigenvalues exp(λ h).
     """
     system = WhippleBicycle().system
     method = nhjax.LobattoIIIAB(5)

@@ -59,7 +59,7 @@ def test_acceleration_and_multiplier_equal_newtons_equations():
 def test_independent_equations_reproduce_the_published_solution(reference):
     np.testing.assert_allclose(reference["q"], PUBLISHED_Q, rtol=0, atol=2e-12)
     np.testing.assert_allclose(reference["v"], PUBLISHED_V, rtol=0, atol=2e-11)
-    # The published multiplier is not that of the published state beyond 1e-10.
+    # The published multiplier agrees with the published state only to 1e-10.
     found = reference["multiplier"]
     np.testing.assert_allclose(found, PUBLISHED_MULTIPLIER, rtol=0, atol=2e-10)
     _, own = library_motion(AXIS, END, PUBLISHED_Q, PUBLISHED_V)

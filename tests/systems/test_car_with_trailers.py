@@ -86,7 +86,7 @@ def test_car_in_a_turn_moves_on_circles(steer):
     np.testing.assert_allclose(
         car.v0[jnp.array([2, 4, 5, 6])], rate, rtol=1e-13, atol=0
     )
-    # All axles cut the corner by R² = (R in front)² + h² - d².
+    # Each axle moves on a circle with R² = (R in front)² + h² - d².
     points = car.points(0.0, car.q0)
     if steer == 0:
         np.testing.assert_allclose([p[1] for p in points.values()], 0.0, atol=1e-15)

@@ -90,7 +90,8 @@ def test_run_converges_to_chaplygins_equations_with_method_order(found):
 
 @pytest.mark.long
 def test_constraints_hold_to_round_off_and_invariants_are_conserved(found):
-    # Of 2 to 14 in SI units; the coarsest runs take four times the duration.
+    # Drifts of invariants of 2 to 14 SI units; the coarsest runs take four times the
+    # duration.
     largest = (1e-5, 5e-7, 3e-8)
     assert np.max(found.violation) < 1e-13
     for name, drift in drifts(SPHERES["default"], found).items():

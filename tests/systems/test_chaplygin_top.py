@@ -51,7 +51,7 @@ def test_run_converges_with_method_order(found):
 
 @pytest.mark.long
 def test_constraints_hold_to_round_off_and_energy_is_conserved(found):
-    # Of 12 J; the coarsest runs take four times the duration.
+    # Drifts of an energy of 12 J; the coarsest runs take four times the duration.
     largest = (3e-6, 2e-7, 1e-8)
     assert np.max(found.violation) < 1e-13
     drift = drifts(TOPS["Routh"], found)["energy"]

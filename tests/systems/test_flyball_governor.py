@@ -107,7 +107,7 @@ def test_governor_with_stiff_springs_and_motor_moves_by_kanes_equations():
     start, duration = np.concatenate([SPRUNG.q0, SPRUNG.v0]), 0.1
     q, v = np.split(flow(field, start, np.array([0.0, duration]))[-1], 2)
     counts = (50, 75, 112)
-    # The simplified iteration does not contract: its matrix is without the dampers.
+    # The simplified iteration does not contract: its matrix leaves out the dampers.
     solver = nhjax.Newton()
     found = runs(SPRUNG, 3, counts, duration, np.asarray(TORQUE), solver)
     assert_order(4, counts, found.errors("q", q))

@@ -1,4 +1,4 @@
-"""Constructors of machines name the argument that no motion belongs to."""
+"""Constructors of machines name the argument for which no motion exists."""
 
 import numpy as np
 import pytest

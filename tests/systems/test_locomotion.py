@@ -41,8 +41,8 @@ SPEED = 0.8
 class Case(NamedTuple):
     """An example with `args`, and its motion by the oracle from the same data.
 
-    `field` is that of the state of the oracle, whose last row is the work of the
-    joints; `result` makes (q, v, multiplier) of it.
+    `field` gives the rates of the oracle's state, whose last row is the work of the
+    joints; `result` turns the state into (q, v, multiplier).
     """
 
     example: Snakeboard | RollerRacer
@@ -218,7 +218,7 @@ def test_axles_do_not_slip_along_a_run(case, found):
     example = case.example
     lane = found.lanes[0]
     for q, v in zip(lane.q[::8], lane.v[::8], strict=True):
-        # Along their axles two points move at the speeds of a rigid body.
+        # Differences along the velocity give the speeds of both points.
         h, t = 1e-6, 0.0
         ahead, behind = (example.points(t, jnp.asarray(q + k * h * v)) for k in (1, -1))
         names = ("rear", "front") if "rear" in ahead else ("seat", "handlebar")

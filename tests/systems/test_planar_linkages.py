@@ -69,7 +69,7 @@ def test_acceleration_and_multiplier_equal_crank_equations(machine):
 
 
 def test_crank_turns_in_the_time_of_the_quadrature(machine, reference):
-    # t = ∫ √(I / 2(E + M θ - V)) dθ, with all that is known of the energy.
+    # t = ∫ √(I / 2(E + M θ - V)) dθ, with I and V from the oracle.
     example, oracle = machine
     start, rate = float(example.q0[0]), float(example.v0[0])
 

@@ -118,7 +118,7 @@ def test_rattleback_at_rest_rocks_at_frequency_of_its_curvature():
         rocking.append((rolling.q0, rolling.v0))
     slope, _, _ = accelerations(Rattleback().system, *stack(rocking))
     stiffness = -(slope[:2, 3:5] - slope[2:, 3:5]).T / (2 * e)
-    # About the first axis it rolls along the second one, and the reverse.
+    # About the first axis it rolls along the second one, and vice versa.
     lever = m * g * np.diag([b**2 / c - (c - h), a**2 / c - (c - h)])
     inertia = np.array([[2e-4, 2e-5], [2e-5, 1.6e-3]]) + m * (c - h) ** 2 * np.eye(2)
     expected = np.linalg.solve(inertia, lever)
@@ -134,14 +134,15 @@ def test_run_converges_with_method_order(found, errors_at):
 def test_constraints_hold_to_round_off_and_energy_is_conserved(found):
     assert np.max(found.violation) < 1e-13
     drift = drifts(STONES["default"], found)["energy"]
-    # Of 0.02 J of the spin; the coarsest runs take four times the duration.
+    # Drifts of the spin's energy of 0.02 J; the coarsest runs take four times the
+    # duration.
     largest = (5e-4, 2e-7, 5e-9)
     assert np.all(drift < largest), drift
 
 
 @pytest.fixture(scope="module")
 def first_reversal():
-    """When and how the spin vanishes first, by the equations of the paper."""
+    """When and how the spin first vanishes, by the equations of the paper."""
     angle = np.deg2rad(0.5)
 
     def spin(t, y):
@@ -163,7 +164,7 @@ def first_reversal():
 
 @pytest.fixture(scope="module")
 def spins(first_reversal):
-    """Damped stones that spin in both senses, until the first one stops to spin."""
+    """Damped stones that spin in both senses, until the first one stops spinning."""
     steps, (end, _, _) = 2000, first_reversal
     stones = [
         Rattleback.spinning(spin, (0.5, 0.5), damping=DAMPING) for spin in (5.0, -5.0)

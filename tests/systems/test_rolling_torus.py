@@ -66,7 +66,7 @@ def tumbling():
 @over(BODIES)
 def test_accelerations_and_forces_equal_newton_euler(body):
     oracle = newton_euler(body)
-    # About a disc that stands on its rim.
+    # Attitudes around a disc that stands on its rim.
     upright = Rotation.from_rotvec([0.5 * np.pi, 0, 0])
     states = []
     for quaternion, omega, contact in random_states(20, tilt=1.2):
@@ -100,7 +100,7 @@ def test_accelerations_in_steady_motion_vanish(body):
 
 
 def on_the_circle(body, t):
-    """(attitude, position, v, ω) in steady motion: a turn, and a roll on the axle."""
+    """(attitude, position, v, ω) in steady motion: a turn, then a roll on the axle."""
     tilt, rate, roll, _ = steady_rates(body)
     turn = Rotation.from_rotvec(np.outer(rate * t, [0, 0, 1]))
     spin = Rotation.from_rotvec(np.outer(roll * t, [0, 0, 1]))
@@ -134,7 +134,7 @@ def test_steady_motion_solves_the_equations_of_newton_and_euler(body):
     start = np.asarray(body.q0[:4]), np.asarray(body.v0[3:])
     contact = np.asarray(body.contact_point(body.q0)[:2])
     times = np.linspace(0.1, 1.0, 4)
-    # The instability of some makes the rounding of the start grow.
+    # Some motions are unstable, so that the round-off of the start grows.
     R, omega, contact, _ = newton_euler(body).trajectory(*start, contact, times)
     attitude, _, _, spin = on_the_circle(body, times)
     np.testing.assert_allclose(R, attitude, rtol=0, atol=1e-10)
@@ -159,7 +159,7 @@ def test_run_converges_with_method_order(tumbling):
 @pytest.mark.long
 def test_constraints_hold_to_round_off_and_energy_is_conserved(tumbling):
     body, found = tumbling
-    # Of 12 J; the coarsest runs take four times the duration.
+    # Drifts of an energy of 12 J; the coarsest runs take four times the duration.
     largest = (2e-5, 1e-6, 5e-8)
     assert np.max(found.violation) < 1e-13
     drift = drifts(body, found)["energy"]
@@ -207,7 +207,8 @@ def test_upright_disc_oscillates_at_rouths_frequency(spin):
     slope, _, _ = accelerations(disc.system, *stack(poses))
     rates = []
     for (lean, *omega), omega_dot in zip(states, slope[:, 3:], strict=True):
-        # The turn rate is ω₂/cos(lean), and its part along the axle is not roll.
+        # The turn rate is ω₂/cos(lean), and its part along the axle is not part of the
+        # roll.
         roll = omega[2] + omega[1] * np.tan(lean)
         rates.append([omega[0], *(omega_dot + np.cross([0, 0, roll], omega))])
     rates = np.array(rates)
@@ -244,7 +245,7 @@ def test_steady_motion_is_differentiable_in_its_tilt():
         body = RollingTorus.circling(tilt, 0.0)
         return body.v0[4] / jnp.sin(tilt)
 
-    # Of Ω = √(4g/(a sin θ)).
+    # The slope of Ω = √(4g/(a sin θ)).
     slope = jax.grad(turn_rate)(0.7)
     rate = np.sqrt(4 * 9.81 / (0.5 * np.sin(0.7)))
     assert slope == pytest.approx(-0.5 * rate / np.tan(0.7), rel=1e-13)

@@ -24,8 +24,8 @@ ORACLE = Oracle(
 END = 0.5
 COUNTS = (100, 150, 225, 338)
 
-# The solution by González of the IFToMM library: the place of the slider. Those that
-# others submitted differ from it by 2e-4 at 0.3 s; its own error is below 5e-5.
+# The solution by González of the IFToMM library: the place of the slider. Other
+# submitted solutions differ from it by 2e-4 at 0.3 s; its own error is below 5e-5.
 PUBLISHED = {
     0.1: 0.226785384,
     0.2: 0.263034975,

@@ -10,9 +10,9 @@ from support import bicycle as oracle
 from support.library_motion import library_motion
 
 
-# Basu-Mandal et al. (2007), table 1. Their angles are psi of the lean, theta of the
-# yaw, phi of the pitch, psif of the steer, betar and betaf of the wheels; x, y and z
-# are of the rear wheel's centre, z upwards and x backwards.
+# Basu-Mandal et al. (2007), table 1. Their angles are psi (lean), theta (yaw), phi
+# (pitch), psif (steer), betar and betaf (wheels); x, y and z belong to the rear wheel's
+# centre, z upwards and x backwards.
 STATE = {"psi": 0.9501292851472, "phi": 3.1257073014894, "psif": 0.2311385135743}
 RATES = {
     "xd": -2.8069345714545,

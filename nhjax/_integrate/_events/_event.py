@@ -40,15 +40,15 @@ class Event(eqx.Module):
 
     `integrate(..., event=...)` finds the zeros of `cond_fn(t, y, args)` by its sign at
     the ends of the steps. If the sign changes in a step, the step is repeated with a
-    size θ dt, 0 < θ <= 1, so that the function vanishes to round-off at its end. So the
-    state at the event is the end of a step of the method. The size is differentiated by
-    the implicit function theorem. Then the run ends, or continues with the rest of the
-    step, after a `reset` of the state if there is one.
+    size θ dt, 0 < θ <= 1, such that the function is zero, up to round-off, at the end
+    of the step. So the state at the event is the end of a step of the method. The size
+    is differentiated by the implicit function theorem. If there is a `reset`, it resets
+    the state at the event. Then the run ends, or continues with the rest of the step.
 
     If the function is zero at `t0` or right after an event, its sign is the sign of its
-    rate along the motion. So a trajectory that starts on a surface and leaves it does
-    not trigger the event at the start. If the function touches zero within a step and
-    has the same sign at both ends, the event is not detected.
+    rate along the motion. So a trajectory that starts at a zero and leaves it does not
+    trigger the event at the start. If the function touches zero within a step and has
+    the same sign at both ends, the event is not detected.
 
     **Arguments:**
 
@@ -57,14 +57,14 @@ class Event(eqx.Module):
         `nhjax.continuous_multiplier`.
     - `direction`: detect zeros where the function increases along the run (True), where
         it decreases (False), or both (None).
-    - `reset`: a function (t, y, args) of the state at the event that returns the state
-        from which the run continues: a pair (q, v), for a Hamiltonian system (q, p), or
-        a `State`. It must satisfy the constraints.
+    - `reset`: a function (t, y, args) of the state at the event. It returns the state
+        from which the run continues, as a pair (q, v), or (q, p) for a Hamiltonian
+        system, or as a `State`. The new state must satisfy the constraints.
     - `terminate`: end the run at the event, after its reset. The default is True
         without a `reset`, and False with a `reset`. With False and no `reset`, events
         are only reported.
-    - `max_events`: the number of events that a run has room for, an int >= 1. The
-        limits of several events add up; exceeding the total ends the run with
+    - `max_events`: the largest number of events in a run, an int >= 1. The limits of
+        several events add up; exceeding the total ends the run with
         `RESULTS.too_many_events`. With `terminate` it is 1.
 
     **Raises:** `TypeError` or `ValueError` for arguments of a wrong type or value, and
@@ -264,10 +264,9 @@ def signs_at(
 ) -> tuple[ConditionSigns, BoolScalar]:
     """Compute the signs of all conditions at a state, and whether all are finite.
 
-    A condition counts as zero if, at its present rate, it changes by its own value
-    within a small part of a step: it will be zero or was zero at almost the same time.
-    It also counts as zero if its absolute value is not larger than its `round_off`,
-    which is measured unless it is given.
+    A condition counts as zero if, at its present rate, it reaches zero or has left zero
+    within a small part of a step. It also counts as zero if its absolute value is not
+    larger than its `round_off`, which is measured unless it is given.
     """
     step_state = jax.lax.stop_gradient(step_state)
     system, dt, args = stepper.system, stepper.dt, stepper.args
@@ -310,7 +309,7 @@ def with_continuous_multiplier(
 ) -> State:
     """Return the state with the continuous multiplier λ_c.
 
-    Only the propagated closure leaves another multiplier in the states of a run.
+    The states of a run have another multiplier only with the propagated closure.
     """
     if not method.carries_multiplier:
         return y
@@ -339,7 +338,7 @@ class EventActions(eqx.Module):
 
     An event may have both actions, one or none. The reset comes before the end.
 
-    `max_events` is the number of events that the run has room for.
+    `max_events` is the largest number of events in the run.
     """
 
     resets: tuple[ClosureConverted | None, ...]

@@ -65,8 +65,8 @@ class ImplicitTruncatedStep(AbstractImplicitFunction[Given, TruncatedStep]):
     - `step`: the step of any size.
     - `signs`: the signs of the conditions at the start of the step.
     - `truncates`: whether to truncate the step at the first event in it.
-    - `values_at_end`: in that case the values of the conditions at the end of the whole
-        step.
+    - `values_at_end`: if it is truncated, the values of the conditions at the end of
+        the whole step.
     - `known_event`: the event at which a step of the given size is known to end, -1 for
         none; None if the event must be searched for.
     """
@@ -101,7 +101,7 @@ class ImplicitTruncatedStep(AbstractImplicitFunction[Given, TruncatedStep]):
         )
 
     def _first(self, given: Given) -> _Found:
-        """Find the first event of a step, by steps of other sizes from its start."""
+        """Find the first event in a step, by smaller trial steps from its start."""
         arguments, conditions = given
         h, sign = arguments.h, self.signs.sign
         values_at_end = self._without_start_zero(self.values_at_end, h)
@@ -253,7 +253,7 @@ def _values(
 
 
 def _flat(signs: ConditionSigns, step: TruncatedStep) -> FloatScalar:
-    """Compute the change over a step below which a condition counts as constant."""
+    """Compute the change in a step below which a condition counts as constant."""
     start = signs.scale(step.h)[step.fired]
     small = float(jnp.finfo(start.dtype).eps) ** 0.5
     return small * start

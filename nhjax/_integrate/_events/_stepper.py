@@ -1,8 +1,9 @@
 """The stepper of runs with events: each iteration ends at a node or at an event.
 
-An iteration takes the rest of a step. If there is an event in it, the iteration is
-discarded, and the next one takes the same step again, truncated at the event. So each
-event may take two additional iterations, and an event that ends the run takes one.
+An iteration takes a step, or the rest of it after an event. If there is an event in it,
+the iteration is discarded, and the next one takes the same step again, truncated at the
+event. So each event may need two additional iterations, and an event that ends the run
+needs one.
 """
 
 from dataclasses import replace
@@ -56,7 +57,7 @@ from ._root import ImplicitTruncatedStep, TruncatedStep
 class EventLoopState(eqx.Module):
     """The current place of a run with events.
 
-    Derivatives pass through `offset` alone.
+    Derivatives pass only through `offset`.
 
     - `node`, `offset`: the time is t_k + offset with k = `node`.
     - `row`: the number of output rows that are filled. It equals `node` until the run
@@ -65,13 +66,13 @@ class EventLoopState(eqx.Module):
         the end of the run.
     - `num_events`, `last_event`: the number of events, and the index of the last one.
     - `truncates`: whether the next step is to be truncated, since an event is in it.
-    - `values_at_end`: in that case the values of the conditions at the end of the whole
-        step.
+    - `values_at_end`: if it is truncated, the values of the conditions at the end of
+        the whole step.
     - `signs`: the signs of the conditions.
     - `pending`: the conditions that the last resets have carried across zero, and whose
         events have not happened yet.
-    - `clock`: the time of the last node and the size of the step, in a run whose steps
-      differ.
+    - `clock`: the time of the last node and the size of the step, in a run with
+        variable steps.
     """
 
     node: Int[Array, ""]
@@ -139,10 +140,10 @@ class AttemptedStep(NamedTuple):
     - `values_at_end`: if the step is truncated, the conditions at the end of the whole
         step.
     - `meets`, `fires`: whether there is an event, and whether its action is taken. The
-        action is not taken if there is no room for another event, or if the same event
+        action is not taken if the limit of events is reached, or if the same event
         repeats at the same time.
     - `whole`: the size of the whole step from the last node.
-    - `decision`, `next_step`: in a run whose steps differ, the decision of the
+    - `decision`, `next_step`: in a run with variable steps, the decision of the
         controller about the step, and the step as it would end without events.
     """
 
@@ -213,7 +214,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
 
     @property
     def num_iterations(self) -> int | IntScalar:
-        """Return the number of iterations within which the run is certain to end."""
+        """Return an upper bound on the number of iterations of the run."""
         actions = self.actions
         goes_on = not all(actions.terminates)
         extra = 2 * actions.max_events if goes_on else 0
@@ -251,7 +252,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         return replace(self, plain=self.plain.with_noise(noise))
 
     def progress(self, carry: EventCarry) -> Any:
-        """Compute the part of the run that is done, from 0 to 1, if steps differ."""
+        """Compute the part of the run that is done, from 0 to 1, for variable steps."""
         if self.sizes is None or carry.place.clock is None:
             return None
         return self.sizes.progress(self.plain, carry.place.clock, carry.stats)
@@ -411,9 +412,9 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         solved = is_taken & (step.outcome.result == RESULTS.successful)
         if self.sizes is not None and next_step is not None:
             decision = self._decision(carry, next_step, step, solved)
-            # An event that was found in an inaccurate step may not exist, so that the
-            # step must be accepted. A step that ends at an event is a part of a step
-            # that was accepted before.
+            # An event counts only if its step is accepted, because an event in an
+            # inaccurate step may not exist. A step that ends at an event is a part of a
+            # step that was accepted before.
             solved = solved & (decision.is_accepted | (step.fired >= 0))
         is_discarded = solved & (step.fired < 0) & jnp.any(step.crossed)
         if replay is not None:
@@ -424,7 +425,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         meets = (is_kept | (alive & at_once)) & (which >= 0)
         reached = tree_where(is_kept, step.outcome.step_state, carry.step_state)
         size = jnp.where(is_kept, step.h, 0)
-        # Without this, an event could occur repeatedly at the same time.
+        # `again` stops an event from occurring repeatedly at the same time.
         at_last = (before.num_events > 0) & before.signs.at_zero[which]
         small = 16 * float(jnp.finfo(t.dtype).eps) * jnp.abs(whole)
         again = is_kept & at_last & (jnp.abs(size) <= small)
@@ -502,8 +503,8 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
             )
         if restarted is None:
             return clock, RESULTS.successful
-        # After a reset, the rest of the step up to the next node becomes as long as a
-        # new step.
+        # After a reset, the next node is moved, so that the rest of the step has the
+        # size of a first step.
         size, memory, result = restarted
         size, memory = jax.lax.stop_gradient((size, memory))
         is_reset = attempt.fires & jnp.asarray(resets)[attempt.which]
@@ -599,7 +600,7 @@ def _place_after(
 ) -> EventLoopState:
     """Return the place after an iteration; its signs and rows are not updated yet.
 
-    The events that are `pending` come before a node at the same time.
+    Events that are `pending` are handled before a node at the same time.
     """
     here, dt = before.offset + attempt.size, attempt.whole
     # If the rest of a step is only round-off, it is skipped.
