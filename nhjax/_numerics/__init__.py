@@ -1,13 +1,7 @@
 """The numerical building blocks without mechanics: products, norms, iterations."""
 
 from ._contraction import (
-    inverse as inverse,
-    inverse_by_blocks as inverse_by_blocks,
-    inverses as inverses,
-    mapped as mapped,
-    repeated as repeated,
     small_einsum as small_einsum,
-    solve_by_rows as solve_by_rows,
     with_small_products as with_small_products,
 )
 from ._floating_point import (
@@ -33,6 +27,14 @@ from ._implicit import (
     tree_where as tree_where,
     with_zero_tangents as with_zero_tangents,
     zero_unless as zero_unless,
+)
+from ._inverse import (
+    inverse as inverse,
+    inverse_by_blocks as inverse_by_blocks,
+    inverses as inverses,
+    mapped as mapped,
+    repeated as repeated,
+    solve_by_rows as solve_by_rows,
 )
 from ._iteration import (
     iterate as iterate,

@@ -29,8 +29,9 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._compile import vmapped
 from .._custom_types import BoolScalar, FloatScalar
-from ._contraction import inverse, small_einsum
+from ._contraction import small_einsum
 from ._floating_point import max_norm
+from ._inverse import inverse
 from ._rank import is_nearly_singular
 from ._sparsity import jacobian_sparsity
 

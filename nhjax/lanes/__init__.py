@@ -12,6 +12,7 @@ from ._jaxprs import (
     KEPT_CALL as KEPT_CALL,
     LARGEST_REDUCTION as LARGEST_REDUCTION,
     num_results as num_results,
+    SMALL_INVERSE as SMALL_INVERSE,
     SMALL_PRODUCT as SMALL_PRODUCT,
     WRITE_ROW as WRITE_ROW,
 )

@@ -27,31 +27,13 @@ from ._graph import dtype_name, is_float, LoopBuilder, Node, Unsupported
 from ._jaxprs import WRITE_ROW
 
 
-# A function that rearranges a NumPy array, and returns a view.
-_Move = Callable[[np.ndarray], np.ndarray]
-
-
-def rearranged(builder: Builder, value: ArrayValue, move: _Move) -> ArrayValue:
-    """Apply a function that rearranges NumPy arrays; the array may be in memory."""
-    if not isinstance(value, InMemory):
-        return move(value)
-    memory = builder.memory
-    view = move(flat_indices(value.shape))
-    if view.size <= MOST_IN_REGISTERS:
-        out = np.empty(view.size, object)
-        for index, place in enumerate(view.flat):
-            out[index] = memory.load(value.buffer, None, int(place))
-        return out.reshape(view.shape)
-    target = memory.new(value.dtype, view.size)
-    memory.move(target, flat_indices(view.shape), value.buffer, view)
-    return InMemory(target, view.shape)
-
-
 def _moving(
     move: Callable[..., np.ndarray], builder: Builder, equation: Any, values: list
 ) -> ArrayValue:
     aval = equation.outvars[0].aval
-    return rearranged(builder, values[0], partial(move, equation.params, aval.shape))
+    return builder.memory.rearranged(
+        values[0], partial(move, equation.params, aval.shape)
+    )
 
 
 def _reshape(builder: Builder, equation: Any, values: list[ArrayValue]) -> ArrayValue:
@@ -81,7 +63,7 @@ def _broadcast_in_dim(
             inner[dimension] = length
         return np.broadcast_to(x.reshape(inner), shape)
 
-    return rearranged(builder, value, move)
+    return builder.memory.rearranged(value, move)
 
 
 def _transpose(params: Any, shape: tuple[int, ...], x: np.ndarray) -> np.ndarray:
@@ -104,7 +86,7 @@ def _split(
     axis, start, out = equation.params["axis"], 0, []
     for size in equation.params["sizes"]:
         part = (slice(None),) * axis + (slice(start, start + int(size)),)
-        out.append(rearranged(builder, values[0], lambda x, part=part: x[part]))
+        out.append(builder.memory.rearranged(values[0], lambda x, part=part: x[part]))
         start += int(size)
     return out
 
@@ -119,7 +101,7 @@ def _unstack(
         # A slice is used, because indexing an array with one axis returns an element
         # instead of a view.
         part = (slice(None),) * axis + (slice(index, index + 1),)
-        return rearranged(builder, values[0], lambda x: x[part].squeeze(axis))
+        return builder.memory.rearranged(values[0], lambda x: x[part].squeeze(axis))
 
     return [row(index) for index in rows]
 
@@ -186,7 +168,7 @@ def _pad(builder: Builder, equation: Any, values: list[ArrayValue]) -> ArrayValu
         outer.append(slice(start, start + max(last - first, 0) * step, step))
     if any(part.start == part.stop for part in inner):
         return builder.full(shape, node)
-    part = rearranged(builder, value, lambda x: x[tuple(inner)])
+    part = builder.memory.rearranged(value, lambda x: x[tuple(inner)])
     if isinstance(part, InMemory):
         memory = builder.memory
         target = memory.new(part.dtype, math.prod(shape))
@@ -204,8 +186,8 @@ def _tile(builder: Builder, equation: Any, values: list[ArrayValue]) -> ArrayVal
     for count, length in zip(equation.params["reps"], values[0].shape, strict=True):
         inner += [1, length]
         outer += [int(count), length]
-    tiled = rearranged(
-        builder, values[0], lambda x: np.broadcast_to(x.reshape(inner), outer)
+    tiled = builder.memory.rearranged(
+        values[0], lambda x: np.broadcast_to(x.reshape(inner), outer)
     )
     return tiled.reshape(equation.outvars[0].aval.shape)
 
@@ -283,7 +265,7 @@ def _dynamic_slice(
         return np.empty(sizes, object)
     starts = _starts(builder, value.shape, sizes, starts)
     if all(start.is_constant for start in starts):
-        return rearranged(builder, value, lambda x: x[_window(starts, sizes)])
+        return builder.memory.rearranged(value, lambda x: x[_window(starts, sizes)])
     memory, source = builder.memory, builder.memory.in_memory(value)
     view = flat_indices(value.shape)[tuple(map(slice, sizes))]
     shift = place_in_memory(builder, value.shape, starts)

@@ -188,6 +188,22 @@ class Memory:
     def _sum(self, a: Node, b: Node | None) -> Node:
         return a if b is None else self.graph.op("add", a, b)
 
+    def rearranged(
+        self, value: ArrayValue, move: Callable[[np.ndarray], np.ndarray]
+    ) -> ArrayValue:
+        """Apply a function that rearranges NumPy arrays, and returns a view."""
+        if not isinstance(value, InMemory):
+            return move(value)
+        view = move(flat_indices(value.shape))
+        if view.size <= MOST_IN_REGISTERS:
+            out = np.empty(view.size, object)
+            for index, place in enumerate(view.flat):
+                out[index] = self.load(value.buffer, None, int(place))
+            return out.reshape(view.shape)
+        target = self.new(value.dtype, view.size)
+        self.move(target, flat_indices(view.shape), value.buffer, view)
+        return InMemory(target, view.shape)
+
     def tabulate(
         self, shape: tuple[int, ...], dtype: str, element: Callable[[Node], Node]
     ) -> InMemory:

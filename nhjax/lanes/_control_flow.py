@@ -565,7 +565,7 @@ def _product(
 def _with_axis_first(builder: Builder, value: ArrayValue, axis: int) -> ArrayValue:
     if axis == 0:
         return value
-    return np.moveaxis(builder.memory.registers(value), axis, 0)
+    return builder.memory.rearranged(value, lambda x: np.moveaxis(x, axis, 0))
 
 
 def _written_out(

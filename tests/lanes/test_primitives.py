@@ -12,7 +12,7 @@ import pytest
 from jax import lax
 
 from nhjax._compile import started_like, write_row
-from nhjax._numerics import kept_function, small_einsum
+from nhjax._numerics import inverse, kept_function, small_einsum
 from nhjax.lanes import _jaxprs, _program, Unsupported
 from support import lanes_run
 from support.random_steps import Kind, numbers
@@ -190,7 +190,21 @@ _CASES = {
     "loop_start": [
         (lambda x: started_like((x * 0.0, 2.0 * x), (x, x + 1)), [_of("float64")])
     ],
+    "small_inverse": [
+        (
+            lambda x: inverse(
+                jnp.eye(9) + jnp.sin(x[0] + jnp.arange(81.0)).reshape(9, 9) / 9
+            ),
+            [_of("float64")],
+        )
+    ],
     "small_product": [
+        # The loop over the first index of the result reads columns of an array that is
+        # in memory.
+        (
+            lambda x: small_einsum("ca,cb->ab", jnp.exp(jnp.sin(x)), jnp.tanh(x) ** 2),
+            [Kind("float64", (13, 12))],
+        ),
         (partial(small_einsum, "ab,cb->ca"), [Kind("float32", (2, 3))] * 2),
         (partial(small_einsum, "ia,ib->bai"), [Kind(*MATRIX)] * 2),
         (
@@ -283,7 +297,7 @@ _CASES = {
 _INEXACT = """
     acos acosh asin asinh atan atan2 atanh cbrt cos cosh custom_root erf exp exp2 expm1
     log log1p log2 logistic one_minus_square polynomial pow rsqrt sin sinh tan tanh
-    reduce_sum reduce_prod add_any scan stop_gradient small_product
+    reduce_sum reduce_prod add_any scan stop_gradient small_product small_inverse
 """.split()  # noqa: SIM905
 
 
@@ -294,7 +308,7 @@ def test_lanes_primitives_in_kernels_all_have_cases():
         *_jaxprs._SHAPING,
         *_jaxprs._MOVING,
         *_jaxprs._CONTAINING,
-        _jaxprs.SMALL_PRODUCT,
+        *_jaxprs._SMALL,
     ]
     assert set(names) <= set(_CASES)
 

@@ -1,11 +1,11 @@
-"""Small products and inverses that are written out agree with those of libraries."""
+"""Small products that are written out agree with those of libraries."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nhjax._numerics._contraction import inverse, small_einsum, with_small_products
+from nhjax._numerics._contraction import small_einsum, with_small_products
 
 
 def assert_same(got, expected):
@@ -104,32 +104,6 @@ def test_small_products_of_jaxpr_are_expanded():
     assert "dot_general" in str(program)
     assert "dot_general" not in str(jax.make_jaxpr(written)(x, y))
     assert_same(written(jnp.asarray(x), jnp.asarray(y)), list(function(x, y)))
-
-
-@pytest.mark.parametrize("size", [0, 1, 2, 7, 16, 32, 33])
-def test_inverse_of_any_size_solves(size):
-    matrix = np.random.default_rng(size).normal(size=(size, size))
-    got = inverse(jnp.asarray(matrix))
-    np.testing.assert_allclose(got @ matrix, np.eye(size), rtol=0, atol=1e-12)
-
-
-def test_inverse_with_zero_pivot_exchanges_rows():
-    matrix = jnp.array([[0.0, 2.0, 0.0], [1e-20, 1.0, 1.0], [3.0, 0.0, 0.0]])
-    np.testing.assert_allclose(inverse(matrix) @ matrix, np.eye(3), rtol=0, atol=1e-14)
-
-
-def test_inverse_of_singular_matrix_is_not_finite():
-    for matrix in (jnp.zeros((1, 1)), jnp.ones((2, 2)), jnp.diag(jnp.arange(3.0))):
-        assert not np.all(np.isfinite(inverse(matrix)))
-
-
-def test_derivative_of_inverse_equals_formula():
-    matrix, rate = np.random.default_rng(0).normal(size=(2, 4, 4))
-    x, change = jax.jvp(inverse, (jnp.asarray(matrix),), (jnp.asarray(rate),))
-    np.testing.assert_allclose(change, -x @ rate @ x, rtol=1e-12)
-    gradient = jax.grad(lambda m: jnp.sum(inverse(m) ** 2))(jnp.asarray(matrix))
-    expected = np.sum(2 * np.asarray(x) * change)
-    np.testing.assert_allclose(np.sum(gradient * rate), expected, rtol=1e-12)
 
 
 def test_sum_over_members_of_batch_is_not_expanded():
