@@ -15,7 +15,8 @@ rejected steps. Times are the least of three calls. All programs are compiled by
 comparison at equal error, the steps of a ladder (the runs of one method with different
 steps or tolerances) are interpolated in logarithms.
 
-There are three more parts. `long` follows the energy of the orbit over t = 1e5 with
+There are four more parts. `limits` computes how many steps ideal sizes would
+need. `long` follows the energy of the orbit over t = 1e5 with
 constant, PID and reversible steps, and draws docs/step_sizes.png. `stages` measures
 which number of stages reaches a given error fastest. `tolerance` compares errors
 with tolerances for machines of the gallery, and draws docs/tolerances.png.
@@ -46,7 +47,7 @@ from ._report import least_time, markdown_table, number, RESULTS, write
 
 
 LAST_BETA = 1e-3
-PARTS = "cases", "long", "stages", "tolerance"
+PARTS = "cases", "limits", "long", "stages", "tolerance"
 DOCS = Path(__file__).parent.parent / "docs"
 SAVED = RESULTS / "adaptive_steps.json"
 
@@ -79,7 +80,8 @@ def doubled(first: int, number: int) -> tuple[int, ...]:
 def rattleback() -> Case:
     """Create a rattleback whose spin reverses."""
     stone = systems.Rattleback.spinning(5.0, (0.5, 0.5))
-    return Case(stone.system, stone.initial_state(), 10.0, doubled(2000, 6))
+    eps = (1.2, 0.8, 0.4, 0.2, 0.1)
+    return Case(stone.system, stone.initial_state(), 10.0, doubled(2000, 6), eps)
 
 
 def eulers_disc() -> Case:
@@ -134,7 +136,8 @@ def whip() -> Case:
     chain = systems.PendulumChain.swinging(
         angles=angles, lengths=lengths, masses=masses, gravity=9.81
     )
-    return Case(chain.system, chain.initial_state(), 0.6, doubled(24, 6))
+    eps = (1.2, 0.8, 0.4, 0.2)
+    return Case(chain.system, chain.initial_state(), 0.6, doubled(24, 6), eps)
 
 
 def falling_bicycle() -> Case:
@@ -149,7 +152,7 @@ def falling_bicycle() -> Case:
         stepsize_controller=nhjax.PIDController(1e-8, 1e-10),
         event=nhjax.Event(lambda t, y, args: jnp.abs(y.q[3]) - 1.3),
     )
-    return Case(system, y0, float(end.t1), doubled(64, 6))
+    return Case(system, y0, float(end.t1), doubled(64, 6), (1.2, 0.8, 0.4, 0.2))
 
 
 def smooth(name: str, t1: float, first: int) -> Case:
@@ -433,6 +436,103 @@ HEADER = [
 ]
 
 
+# --- What an ideal choice of sizes would need -----------------------------------------
+
+# The numbers of constant steps that have errors of about 1e-4, or 1e-7 for the bicycle.
+LIMIT_STEPS = {
+    "rattleback that reverses": 6000,
+    "Euler's disc": 16384,
+    "orbit with close passes": 16384,
+    "whip of ten pendulums": 48,
+    "bicycle that falls": 192,
+}
+
+
+class Limits(NamedTuple):
+    """The steps that ideal sizes would need, relative to constant steps.
+
+    - `cancellation`: |Σ w_n| / Σ |w_n| for the errors w_n of the steps, transported to
+        the end of the run.
+    - `adding`: the least ratio of steps if errors add up with both kinds of steps.
+    - `cancelling`: the least ratio if only the errors of constant steps cancel.
+    """
+
+    cancellation: float
+    adding: float
+    cancelling: float
+
+
+def limits(case: Case, count: int) -> Limits:
+    """Compute what the best sizes could save, from the errors of constant steps.
+
+    The error of a step at t_n is d(t_n) h^k with k = 2 s - 1, and |w_n| is its size at
+    the end of the run. With sizes h(t) the errors add up to ∫ d h^(k-1) dt, and the
+    number of steps is ∫ dt / h. For a given sum, the number is least with h
+    proportional to d^(-1/k). The ratio of this number to the number of constant steps
+    is ((mean |w|^(1/k))^k / mean |w|)^(1/(k-1)).
+    """
+    method, fine = nhjax.LobattoIIIAB(case.stages), nhjax.LobattoIIIAB(6)
+    h = case.t1 / count
+    sol = nhjax.integrate(
+        case.system,
+        method,
+        case.start,
+        dt=h,
+        num_steps=count,
+        saveat=nhjax.SaveAt(t0=True, steps=True),
+    )
+    _, unflatten = ravel_pytree(case.start)
+    starts = jax.vmap(lambda y: ravel_pytree(y)[0])(sol.ys)[:-1]
+
+    def end(method: nhjax.LobattoIIIAB, x: Array, t: Array) -> Array:
+        state = nhjax.step(case.system, method, t, h, unflatten(x), throw=False)
+        return ravel_pytree(state)[0]
+
+    @jax.jit
+    def error_and_jacobian(given: tuple[Array, Array]) -> tuple[Array, Array]:
+        x, t = given
+        jacobian = jax.jacfwd(lambda x: end(method, x, t))(x)
+        return end(method, x, t) - end(fine, x, t), jacobian
+
+    found = jax.lax.map(error_and_jacobian, (starts, sol.ts[:-1]), batch_size=64)
+    errors, jacobians = map(np.asarray, found)
+    places = unflatten(jnp.arange(starts.shape[1], dtype=starts.dtype))
+    kept = np.asarray(ravel_pytree((places.q, places.v))[0]).astype(int)
+    transport, transported = np.eye(starts.shape[1])[kept], []
+    for error, jacobian in zip(errors[::-1], jacobians[::-1], strict=True):
+        transported.append(transport @ error)
+        transport = transport @ jacobian
+    sizes = np.max(np.abs(transported), axis=1)
+    k = 2 * case.stages - 1
+    adding = (np.mean(sizes ** (1 / k)) ** k / np.mean(sizes)) ** (1 / (k - 1))
+    cancellation = float(np.max(np.abs(np.sum(transported, axis=0))) / np.sum(sizes))
+    return Limits(cancellation, adding, adding / cancellation ** (1 / (k - 1)))
+
+
+def measure_limits() -> tuple[str, dict[str, Any]]:
+    """Compute the limits of all motions with fast phases."""
+    table, rows = [], []
+    for name, count in LIMIT_STEPS.items():
+        found = limits(CASES[name](), count)
+        print(name, found, flush=True)
+        rows.append({"case": name, "steps": count, **found._asdict()})
+        table.append([name, str(count), *(f"{x:.2g}" for x in found)])
+    text = (
+        "## What an ideal choice of sizes would need\n\n"
+        "From the errors of constant steps, transported to the end: the size of their "
+        "sum over the sum of their sizes, and the least number of steps with the same "
+        "error at the end, relative to the number of constant steps.\n\n"
+    )
+    header = [
+        "motion",
+        "constant steps",
+        "sum of errors / sum of sizes",
+        "least steps if errors add up, ratio",
+        "least steps if only errors of constant steps cancel, ratio",
+    ]
+    return text + markdown_table(header, table), {"limits": rows}
+
+
 # --- The energy over a long time ------------------------------------------------------
 
 LONG, ROWS = 1e5, 2000
@@ -641,6 +741,7 @@ def main() -> None:
     data: dict[str, Any] = {"texts": {}} | saved
     measured = {
         "cases": lambda: measure_cases(options.only),
+        "limits": measure_limits,
         "long": measure_long,
         "stages": measure_stages,
         "tolerance": measure_tolerances,

@@ -3,9 +3,10 @@
 The table also has the time of a later call of the same program.
 
 Vectorised programs (the engine `lanes`) are compiled to native code while JAX lowers
-them. The bicycle has eight coordinates and five constraints, written as a user would
-write them. Each program is compiled by two processes, one after the other, which share
-a directory for JAX's compilation cache. The directory is empty at first: the first
+them; the column "of which LLVM" is the part of this time that LLVM needs, and the
+rest is Python. The bicycle has eight coordinates and five constraints, written as a
+user would write them. Each program is compiled by two processes, one after the other,
+which share a directory for JAX's compilation cache, empty at first: the first
 process stores its compiled programs there, and the second process loads them.
 
     python -m benchmarks.compile_time
@@ -17,18 +18,21 @@ import json
 import tempfile
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
 
 import nhjax
 from nhjax import systems
+from nhjax.lanes._native import object_code
 
 from ._examples import wheeled_inverted_pendulum
 from ._report import from_fresh_process, least_time, markdown_table, write
 
 
+T = TypeVar("T")
 NUM_STEPS = 20
 KINDS = ("run", "ensemble", "gradient")
 
@@ -97,6 +101,21 @@ def compiled(function: Callable[..., Any], *args: Any) -> tuple[Any, list[float]
     return program, [after - before for before, after in itertools.pairwise(times)]
 
 
+def with_llvm_timed(call: Callable[[], T]) -> tuple[T, float]:
+    """Return the result of a call, and the seconds of it that LLVM needs."""
+    seconds = 0.0
+
+    def timed(*args: Any) -> bytes:
+        nonlocal seconds
+        start = time.process_time()
+        code = object_code(*args)
+        seconds += time.process_time() - start
+        return code
+
+    with mock.patch("nhjax.lanes._program.object_code", timed):
+        return call(), seconds
+
+
 def plain_calls() -> list[tuple[str, float]]:
     """Measure first calls, in seconds, as a user of a small machine would make them."""
     system, q, v, gains = wheeled_inverted_pendulum()
@@ -141,9 +160,11 @@ def measure(index: int) -> None:
     jax.jit(jnp.sin).lower(0.1).compile()
     _, system, y0, stages, kind = cases()[index]
     dt = jnp.full((8,), 0.05) if kind == "ensemble" else jnp.asarray(0.05)
-    ready, parts = compiled(program(system, stages, kind), y0, dt)
+    (ready, parts), llvm = with_llvm_timed(
+        lambda: compiled(program(system, stages, kind), y0, dt)
+    )
     later = least_time(lambda: ready(y0, dt), 15)
-    print(json.dumps({"parts": parts, "later": later}))
+    print(json.dumps({"parts": parts, "llvm": llvm, "later": later}))
 
 
 def in_process(index: int, directory: str) -> dict[str, Any]:
@@ -173,18 +194,26 @@ def main() -> None:
             continue
         with tempfile.TemporaryDirectory() as directory:
             first, second = (in_process(index, directory) for _ in range(2))
-        later = first["later"]
+        later, llvm = first["later"], first["llvm"]
         first, second = first["parts"], second["parts"]
         ratio = sum(second) / sum(first)
-        times = [f"{x:.1f}" for x in (*first, sum(first), sum(second))]
+        shown = (*first[:2], llvm, first[2], sum(first), sum(second))
+        times = [f"{x:.1f}" for x in shown]
         row = [name, str(stages), kind, *times, f"{ratio:.2f}", f"{1e3 * later:.2g}"]
         print(*row, sep="\t", flush=True)
         rows.append(row)
         case = {"system": name, "stages": stages, "kind": kind}
         data.append(
-            {**case, "seconds": first, "second_process": second, "later": later}
+            {
+                **case,
+                "seconds": first,
+                "llvm": llvm,
+                "second_process": second,
+                "later": later,
+            }
         )
-    parts = ["trace", "lower", "compile", "all", "all, second process", "ratio"]
+    parts = ["trace", "lower", "of which LLVM", "compile", "all"]
+    parts += ["all, second process", "ratio"]
     text = (
         f"Seconds of the processor, for programs of {NUM_STEPS} steps; the last column "
         "is the least time of a later call.\n\n"

@@ -7,7 +7,8 @@ largest step size with which all steps are solved, found to within a factor of 1
 `benchmarks.machines` measures the first calls of all machines with default options.
 
 A second table compares `Newton` with `SimplifiedNewton(jacobian="full")` on some of the
-machines.
+machines. A third table compares the times of runs whose steps are just small enough
+for an error of 1e-6 at the end.
 
     python -m benchmarks.iterations
     python -m benchmarks.iterations --only newton
@@ -26,7 +27,7 @@ import numpy as np
 import nhjax
 from nhjax import systems
 
-from ._report import markdown_table, RESULTS, write
+from ._report import least_time, markdown_table, RESULTS, write
 
 
 NUM_STEPS = 20
@@ -42,6 +43,9 @@ BY_NEWTON = (
 LARGEST_FACTOR = 32
 STEP_RATIO = 1.2
 RADIUS, LENGTH, TRACK = 0.1, 0.35, 0.5
+# The runs of the third table: their length, the largest error at the end, the number of
+# members in a batch, and the factor between the tried numbers of steps.
+DURATION, LARGEST_ERROR, MEMBERS, COUNT_RATIO = 20.0, 1e-6, 64, 1.25
 
 
 class Case(NamedTuple):
@@ -201,6 +205,84 @@ def newton_table(names: list[str] | None) -> list[dict[str, Any]]:
     return data
 
 
+def machines_for_errors() -> Iterator[tuple[str, Any, nhjax.State, int]]:
+    """Machines of the third table, with the first number of steps to try."""
+    bicycle = systems.WhippleBicycle.running(4.6, lean_rate=0.5)
+    torus, bars = systems.RollingTorus(), systems.FourBar()
+    stone = systems.Rattleback.spinning(5.0, (0.5, 0.5))
+    yield "bicycle, 4.6 m/s", bicycle.system, bicycle.initial_state(), 100
+    yield "RollingTorus", torus.system, torus.initial_state(), 100
+    yield "FourBar", bars.system, bars.initial_state(), 300
+    yield "Rattleback", stone.system, stone.initial_state(), 4000
+
+
+def errors_table(names: list[str] | None) -> list[dict[str, Any]]:
+    """Measure times to a given error with the default and the full Jacobian."""
+    data = []
+    for name, system, y0, first in machines_for_errors():
+        if names and not any(part in name for part in names):
+            continue
+        fine = nhjax.integrate(
+            system,
+            nhjax.LobattoIIIAB(6),
+            y0,
+            t1=DURATION,
+            stepsize_controller=nhjax.PIDController(1e-12, 1e-13),
+            stage_solver=nhjax.SimplifiedNewton(jacobian="full", fallback=False),
+            max_steps=10**6,
+        )
+        exact = end_of(fine)
+        found = {
+            key: time_to_error(system, y0, first, exact, jacobian)
+            for key, jacobian in (("default", None), ("full", "full"))
+        }
+        data.append({"name": name, **found})
+        print(data[-1], flush=True)
+        jax.clear_caches()
+    return data
+
+
+def end_of(sol: nhjax.Solution) -> np.ndarray:
+    """Return (q, v) at the end of a run, or NaN if it failed."""
+    end = np.concatenate(
+        [np.ravel(x[-1]) for x in jax.tree.leaves((sol.ys.q, sol.ys.v))]
+    )
+    return end if sol.result == nhjax.RESULTS.successful else np.full_like(end, np.nan)
+
+
+def time_to_error(
+    system: Any, y0: nhjax.State, first: int, exact: np.ndarray, jacobian: Any
+) -> dict[str, Any]:
+    """Find the number of constant steps with the given error, and time such runs."""
+    solver = nhjax.SimplifiedNewton(jacobian=jacobian, fallback=False)
+
+    def integrate(y0, dt, count):
+        return nhjax.integrate(
+            system,
+            nhjax.LobattoIIIAB(4),
+            y0,
+            dt=dt,
+            num_steps=count,
+            stage_solver=solver,
+            throw=False,
+        )
+
+    run, batch = jax.jit(integrate), jax.jit(jax.vmap(integrate, (0, None, None)))
+    starts = jax.tree.map(lambda x: jnp.broadcast_to(x, (MEMBERS, *x.shape)), y0)
+    count, error = first, np.inf
+    while not error <= LARGEST_ERROR * np.max(np.abs(exact)):
+        count = round(COUNT_RATIO * count)
+        given = jnp.asarray(DURATION / count), jnp.asarray(count)
+        sol = run(y0, *given)
+        error = np.max(np.abs(end_of(sol) - exact))
+    return {
+        "steps": count,
+        "iterations": float(sol.stats["num_iterations"]) / count,
+        "single": least_time(lambda: run(y0, *given), 5),
+        "batch": least_time(lambda: batch(starts, *given), 3),
+    }
+
+
 def pair(row: dict[str, Any], names: tuple[str, str], key: str, digits: str) -> str:
     """Format a quantity of two solvers; a run that is not solved is shown as failed."""
     shown = [
@@ -244,16 +326,41 @@ def report(data: dict[str, list[dict[str, Any]]]) -> str:
         for row in data["newton"]
     ]
     text += "\n\n## Newton's method\n\n`Newton()` / full Jacobian, measured alike.\n\n"
-    return text + markdown_table([*header, "ratio of the times"], rows)
+    text += markdown_table([*header, "ratio of the times"], rows)
+    text += (
+        f"\n\n## Times to an error of {LARGEST_ERROR:g}\n\n"
+        f"Default / full Jacobian, four stages, {DURATION:g} s, the fewest steps with "
+        "this error at the end relative to the state, and the ratio of the times of "
+        f"one run, and of {MEMBERS} equal members.\n\n"
+    )
+    both = "default", "full"
+    rows = []
+    for row in data["errors"]:
+        line = [row["name"]]
+        for key, scale, digits in (
+            ("steps", 1, ".0f"),
+            ("iterations", 1, ".1f"),
+            ("single", 1e3, ".1f"),
+            ("batch", 1e3, ".1f"),
+        ):
+            line.append(" / ".join(format(scale * row[x][key], digits) for x in both))
+        line += [
+            f"{row['full'][key] / row['default'][key]:.2f}"
+            for key in ("single", "batch")
+        ]
+        rows.append(line)
+    header = ["machine", "steps", "iterations a step", "one run, ms"]
+    header += [f"{MEMBERS} members, ms", "ratio, one run", f"ratio, {MEMBERS} members"]
+    return text + markdown_table(header, rows)
 
 
 def main() -> None:
     """Print and save the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--systems", nargs="+", help="a part of the names")
-    tables = {"rows": machines_table, "newton": newton_table}
+    tables = {"rows": machines_table, "newton": newton_table, "errors": errors_table}
     parser.add_argument(
-        "--only", choices=tables, help="measure one table, and keep the other as saved"
+        "--only", choices=tables, help="measure one table, and keep the others as saved"
     )
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)

@@ -307,7 +307,8 @@ class Heightfield(eqx.Module):
         last = jnp.asarray(np.asarray(self.coefficients.shape) - 6, x.dtype)
         cell = jnp.clip(jnp.floor(jax.lax.stop_gradient(place)), 0 * last, last)
         weights = jax.vmap(_spline_weights)(place - cell)
-        # The coefficient of the first row of the grid has the index 2.
+        # Row i of the grid has the coefficient with the index i + 2, and the four
+        # coefficients of a cell begin one row before it.
         first = cell.astype(jnp.int32) + 1
         coefficients = jnp.asarray(self.coefficients, x.dtype)
         near = jax.lax.dynamic_slice(coefficients, first, (4, 4))
@@ -437,7 +438,7 @@ class AbstractContact(eqx.Module):
     def frame(
         self, t: FloatScalarLike, q: PyTree[Array], args: Args = None
     ) -> Float[Array, "3 3"]:
-        """Compute the frame of the contact: the rows are along, across and normal."""
+        """Compute the contact's frame, with the rows `along`, `across` and normal."""
         position, rotation = self.place(t, q, args)
         normal = self._touch(position, rotation, args).normal
         return jnp.concatenate([self.axes(rotation, normal), normal[None]])

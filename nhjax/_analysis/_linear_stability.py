@@ -108,12 +108,12 @@ def linear_stability(
     - `args`: passed on to the functions of the system.
     - `positions`, `velocities`: the indices of the independent coordinates and of the
         independent velocities (of momenta for a Hamiltonian system), which form z. All
-        other velocities must follow from the constraints, so that there are n - m - k
-        independent velocities. Coordinates that are not in `positions`
-        and do not follow from holonomic constraints are not perturbed. Omit coordinates
-        on which the motion does not depend, such as the position of a wheel. By
-        default, z consists of coordinates in an orthonormal basis of all perturbations
-        that the constraints permit.
+        other velocities must follow from the constraints: with m nonholonomic and k
+        holonomic constraints there are n - m - k independent velocities. Coordinates
+        that are not in `positions` and do not follow from holonomic constraints are not
+        perturbed. Omit coordinates on which the motion does not depend, such as the
+        position of a wheel. By default, z consists of coordinates in an orthonormal
+        basis of all perturbations that the constraints permit.
     - `symmetry`: generators of symmetries: a function, like the `generator` of
         `momentum_map`, that is called as `symmetry(q)` and returns vectors in the
         components of the velocity, of shape (n,) or (k, n). On a group, the generator

@@ -88,7 +88,7 @@ def _is_installed(module: str) -> bool:
 class _Identity:
     """An object that is compared by its identity.
 
-    The object is stored too, so that no other object gets the same identity.
+    The object is stored too: while it exists, no other object gets its identity.
     """
 
     number: int

@@ -65,7 +65,7 @@ class Mean(AbstractReduction):
     - `of`: a function that selects, from the value of a member, the part to average;
         by default everything.
 
-    **Returns:** in the outcome, a tree with the shapes of the value of one member.
+    **Returns:** the outcome has a tree with the shapes of the value of one member.
 
     !!! example
 
@@ -121,7 +121,7 @@ class Variance(AbstractReduction):
         default everything.
     - `ddof`: the number subtracted from the number of members, 1 by default.
 
-    **Returns:** in the outcome, a tree with the shapes of the value of one member.
+    **Returns:** the outcome has a tree with the shapes of the value of one member.
 
     **Raises:** `ValueError` if there are `ddof` members or fewer.
 
@@ -302,7 +302,7 @@ class Histogram(AbstractReduction):
     - `of`: a function that selects, from the value of a member, the part to count; by
         default everything.
 
-    **Returns:** in the outcome, an `nhjax.HistogramCounts` in place of each array.
+    **Returns:** the outcome has an `nhjax.HistogramCounts` in place of each array.
 
     **Raises:** `ValueError` if the edges do not increase or are not finite.
 

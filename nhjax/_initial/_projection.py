@@ -225,7 +225,8 @@ Vector = Float[Array, " n"]
 class Fixed(NamedTuple):
     """The combinations of constraints that the kept components determine.
 
-    Each row belongs to one constraint and is divided by the size of its derivatives.
+    Each constraint is divided by the size of its derivatives. The rows of `projector`
+    and `slopes` belong to the constraints.
 
     - `sizes`: the sizes of the derivatives of the constraints.
     - `projector`: the projector onto the combinations that are constant, to first
@@ -281,8 +282,9 @@ def project_position(system, t, q, u, args, kept: Kept, given: PyTree[Array]):
         return nearest._replace(x=manifold.act(q, nearest.x))
     terms = jnp.full(len(kept.indices), max_norm(*jax.tree.leaves(q)))
     nearest = _nearest_keeping(mass, gamma, held, zero, sizes, terms, is_redundant)
-    # A condition such as w = 1 on a unit quaternion has zero derivative where it holds,
-    # so that the search can converge although the condition is violated.
+    # A condition such as w = 1 on a unit quaternion has zero derivative where it holds.
+    # A search that starts there leaves the condition out of its equations, and can
+    # converge although the condition is violated.
     moved = manifold.act(q, nearest.x)
     size = max_norm(*jax.tree.leaves(stop_gradient((q, moved))))
     off = max_norm(stop_gradient(held(nearest.x)))

@@ -60,8 +60,8 @@ def _run(arguments: tuple[Loop, AbstractCarry]) -> tuple[AbstractCarry, Rows]:
 @_run.def_fwd
 def _run_fwd(perturbed, arguments):
     del perturbed
-    # Calling `_run` here would rule out forward mode over this reverse mode, because
-    # `_run` has a custom rule for reverse mode.
+    # `_run` is not called here: it has a custom rule for reverse mode, so that forward
+    # mode could not differentiate this reverse mode.
     carry, rows = DirectAdjoint().run(*arguments)
     # The backward pass needs only the shapes of the buffers, and the log.
     shapes = jax.eval_shape(lambda: rows)

@@ -262,9 +262,12 @@ class PIDController(AbstractStepSizeController):
         β3 = dcoeff / k
 
     (Söderlind, Digital filters in adaptive time-stepping, 2003, and the controller of
-    the same name in diffrax). Use a method with three stages or more: with two stages,
-    the estimated error of some steps is zero. Sizes that follow the error destroy the
-    reversibility of a method, so that energies may drift; see
+    the same name in diffrax). If the errors grow from step to step, so that
+    r_n = (h_n / h_{n-1}) (e_{n-1} / e_n)^(1/k) is below one, the next size is at most
+    h_n safety e_n^{-1/k} r_n (Gustafsson, Control-theoretic techniques for stepsize
+    selection in implicit Runge-Kutta methods, 1994). Use a method with three stages or
+    more: with two stages, the estimated error of some steps is zero. Sizes that follow
+    the error destroy the reversibility of a method, so that energies may drift; see
     `nhjax.ReversibleController`.
 
     **Arguments:**
@@ -272,7 +275,7 @@ class PIDController(AbstractStepSizeController):
     - `rtol`, `atol`: the relative and the absolute tolerance. For a position on a
         group, |y| is the largest absolute value among the numbers of the element.
     - `pcoeff`, `icoeff`, `dcoeff`: the coefficients of the controller. With the default
-        coefficients, the next size depends on the last error only.
+        coefficients, the next size depends on e_n and r_n only.
     - `dtmin`, `dtmax`: the smallest and the largest size of a step, in units of time,
         both positive. A run that needs smaller steps fails. The last step of a run
         and steps to events may be smaller.
@@ -382,10 +385,11 @@ class PIDController(AbstractStepSizeController):
         self, context: StepContext, t: FloatScalar, start: StepState
     ) -> tuple[FloatScalar, Memory, RESULTS]:
         """Return `dt` or, if None, a size that changes the state by one percent."""
-        # Before the first step there are no earlier errors and growth rates. The errors
-        # are taken as one, and the growth rates as infinite, which means unknown.
+        # Before the first step there are no earlier errors, sizes and growth rates. The
+        # errors are taken as one, the size as zero, so that no trend is predicted, and
+        # the growth rates as infinite, which means unknown.
         one = jnp.ones((), t.dtype)
-        memory = one, one, jnp.full(2, jnp.inf, t.dtype)
+        memory = one, one, jnp.zeros((), t.dtype), jnp.full(2, jnp.inf, t.dtype)
         if context.dt is not None:
             size = jnp.abs(context.dt)
         else:
@@ -448,7 +452,7 @@ class PIDController(AbstractStepSizeController):
         """Accept a step if its estimated error is at most one tolerance."""
         start, outcome, h = attempt.start, attempt.outcome, attempt.h
         scales = self._scales(context, start, outcome.step_state)
-        last, before_last, growth_rates = memory
+        last, before_last, last_size, growth_rates = memory
         error, found = local_error(
             *(context.system, context.method, attempt.t, h),
             *(start, outcome, scales, context.args, growth_rates),
@@ -473,13 +477,23 @@ class PIDController(AbstractStepSizeController):
         estimate = jnp.where(is_known, error, jnp.inf)
         # An error below this bound already gives the largest factor. The bound keeps
         # the error positive, so that its negative powers are finite.
-        error = jnp.maximum(error, (safety / most) ** number)
+        bound = (safety / most) ** number
+        error = jnp.maximum(error, jnp.maximum(bound, float(jnp.finfo(dtype).tiny)))
         factor = (
             safety
             * error ** (-(p + i + d) / number)
             * last ** ((p + 2 * d) / number)
             * before_last ** (-d / number)
         )
+        # If errors grow, the next size is reduced in advance. Without this, a quarter
+        # of the steps of an orbit with close passes were rejected. A very small earlier
+        # error may be due to chance.
+        growth = jnp.maximum(last, 0.01) / error
+        change = size / jnp.where(last_size > 0, last_size, size)
+        trend = change * growth ** (1 / number)
+        is_trend = accepted & (error > bound) & (trend < 1)
+        predicted = safety * error ** (-1 / number) * trend
+        factor = jnp.where(is_trend, jnp.minimum(factor, predicted), factor)
         factor = jnp.clip(factor, least, jnp.where(accepted, most, safety))
         factor = jnp.where(is_known, factor, least)
         following = self._limited(size * factor)
@@ -503,15 +517,21 @@ class PIDController(AbstractStepSizeController):
             result,
             outcome.result,
         )
+        memory = error, last, size, growth_rates
         size = jax.lax.stop_gradient(following) * context.direction
-        memory = error, last, growth_rates
         return Decision(accepted, result, size, memory, estimate)
 
     def resume(
         self, context: StepContext, size: FloatScalar, memory: Memory
     ) -> tuple[FloatScalar, Memory]:
         """Return `dt` if the user gives it, otherwise the size in the checkpoint."""
-        size = jnp.abs(size if context.dt is None else context.dt)
+        if context.dt is not None:
+            # Earlier errors and sizes say nothing about a size that the user gives.
+            *_, growth_rates = memory
+            one = jnp.ones((), size.dtype)
+            memory = one, one, jnp.zeros_like(one), growth_rates
+            size = context.dt
+        size = jnp.abs(size)
         size = jax.lax.stop_gradient(self._limited(size))
         return size * context.direction, memory
 
@@ -666,7 +686,7 @@ class ReversibleController(AbstractStepSizeController):
             RESULTS.density_not_positive,
         )
         size = jnp.where(result == RESULTS.successful, size, context.direction)
-        # The memory is a single array, unlike the three arrays of a `PIDController`.
+        # The memory is a single array, unlike the four arrays of a `PIDController`.
         # Checkpoints of the two controllers can therefore be told apart.
         return size, jnp.stack([density, rate]), result
 

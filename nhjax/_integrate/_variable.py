@@ -443,7 +443,7 @@ class VariableReverseReplay(AbstractReverseReplay[VariableCarry, StepLogEntry]):
     def places(
         self, replay: StepLogEntry, i: Int[Array, ""]
     ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-        """Return the index of the step, which is its row and its place in the log."""
+        """Return the index of the step twice: as output row and place in the log."""
         del replay
         number = jnp.asarray(i, jnp.int32)
         return number, number

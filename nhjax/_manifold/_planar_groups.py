@@ -86,7 +86,7 @@ class SO2(AbstractLieGroup):
         return self.retraction.in_chart(xi[0] ** 2)
 
     def compose(self, g: Angle, h: Angle) -> Angle:
-        """Compute the sum of the angles, the product of the rotations."""
+        """Compute the sum of the angles, the angle of the product of the rotations."""
         return g + h
 
     def inverse(self, g: Angle) -> Angle:

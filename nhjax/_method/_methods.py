@@ -353,8 +353,9 @@ class LobattoIIIAB(AbstractMethod):
 
         With more stages, steps can be larger, which saves time if errors must be small.
         With the returned number of stages, the error at the end of a run was most often
-        within a factor of ten of `rtol`. With one or two stages more, runs to the same
-        error take less time, but the error is often far smaller than `rtol`.
+        within a factor of ten of `rtol`. With one or two stages more, a run takes
+        less time for the same error, but needs a larger `rtol`, because the error is
+        often far smaller than `rtol`.
         `benchmarks.adaptive_steps` measured both facts.
 
         **Arguments:**

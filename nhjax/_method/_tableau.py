@@ -237,7 +237,8 @@ def legendre(degree: int, x: Number) -> list[Number]:
     **Arguments:**
 
     - `degree`: the highest degree.
-    - `x`: an mpmath number, or any number with exact integer multiples.
+    - `x`: an mpmath number, or a number of another type in which multiplication by
+        integers is exact.
 
     **Returns:**
 

@@ -46,7 +46,8 @@ def inverse(matrix: Float[Array, "n *n"]) -> Float[Array, "n *n"]:
     if size > LARGEST:
         return jnp.linalg.inv(matrix)
     if size >= _BY_ROWS_FROM:
-        return _small_inverse.bind(matrix)
+        program = jax.make_jaxpr(compiled_once_inverse)(matrix)
+        return _small_inverse.bind(matrix, program=program)
     return compiled_once_inverse(matrix)
 
 
@@ -64,7 +65,7 @@ def compiled_once_inverse(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
     """Invert a matrix by Gauss-Jordan elimination in place, with row pivoting.
 
     Because of its name, `nhjax.lanes` compiles this function once for all matrices of
-    the same size.
+    the same size, if they have fewer than `_BY_ROWS_FROM` rows.
     """
     rows = jnp.arange(matrix.shape[0])
 
@@ -110,17 +111,30 @@ def _sum_of_rows(rows: Float[Array, "k n"]) -> Float[Array, " n"]:
 
 
 # An inverse of at least `_BY_ROWS_FROM` rows is one operation until it is lowered. XLA,
-# for which each operation in a loop has a high cost, lowers it to operations on the
-# whole matrix. `nhjax.lanes` replaces it by its implementation, which has loops over
-# rows.
+# for which each operation in a loop has a high cost, computes the operations on the
+# whole matrix, which are the parameter `program`. `nhjax.lanes` replaces the operation
+# by its implementation, traced, which has loops over rows.
 _small_inverse = jax.extend.core.Primitive(SMALL_INVERSE)
 _small_inverse.is_high = never_high
 
 
 @_small_inverse.def_impl
-@jax.jit
+def _implementation(matrix: Array, *, program: Any) -> Array:
+    if isinstance(matrix, jax.core.Tracer):
+        return _inverse_by_rows(matrix)
+    return _by_program(matrix, program=program)
+
+
+def _by_program(matrix: Array, *, program: Any) -> Array:
+    return jax.extend.core.jaxpr_as_fun(program)(matrix)[0]
+
+
 def _inverse_by_rows(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Compute the same as `compiled_once_inverse`, in loops over single rows."""
+    """Compute the same as `compiled_once_inverse`, in loops over single rows.
+
+    Its matrices are in memory, so that `nhjax.lanes` could not compile it as a function
+    with numbers as arguments.
+    """
     size = matrix.shape[0]
     numbers = jnp.arange(size, dtype=jnp.int32)
 
@@ -134,8 +148,8 @@ def _inverse_by_rows(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
             _, _, largest, _ = found
             i = k + offset
             value = entry(table, i, k)
-            # The magnitude NaN is the largest, so that the inverse is not finite.
-            is_larger = ~(jnp.abs(value) <= largest)
+            # As in `argmax`, NaN is the largest magnitude.
+            is_larger = ~(jnp.abs(value) <= largest) & ~jnp.isnan(largest)
             new = i, value, jnp.abs(value), _taken(table, i)
             return jax.tree.map(lambda x, y: jnp.where(is_larger, x, y), new, found)
 
@@ -173,21 +187,18 @@ def _inverse_by_rows(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
 
 
 @_small_inverse.def_abstract_eval
-def _shape(matrix: Any) -> Any:
-    if matrix == jax.core.ShapedArray(matrix.shape, matrix.dtype, matrix.weak_type):
-        return jax.core.ShapedArray(matrix.shape, matrix.dtype)
-    # For operands that are sharded over devices, JAX determines the sharding of the
-    # result.
-    return jax.make_jaxpr(compiled_once_inverse)(matrix).out_avals[0]
+def _shape(matrix: Any, *, program: Any) -> Any:
+    return program.out_avals[0]
 
 
-def _batched(operands: Any, axes: Any) -> tuple[Array, int]:
+def _batched(operands: Any, axes: Any, *, program: Any) -> tuple[Array, int]:
+    del program
     return jax.vmap(compiled_once_inverse, axes)(*operands), 0
 
 
 batching.primitive_batchers[_small_inverse] = _batched
 mlir.register_lowering(
-    _small_inverse, mlir.lower_fun(compiled_once_inverse, multiple_results=False)
+    _small_inverse, mlir.lower_fun(_by_program, multiple_results=False)
 )
 
 

@@ -243,7 +243,7 @@ class SparseMatrix(AbstractOperator):
         return SparseMatrix(jnp.abs(self.values), self.pattern)
 
     def as_matrix(self) -> Float[Array, "l n"]:
-        """Return all entries of one matrix as an array, including zeros."""
+        """Return all entries as an array, including zeros; not defined for a stack."""
         return self.rmatvec(jnp.eye(self.pattern.shape[0], dtype=self.values.dtype))
 
     def weighted_transpose(self, weights: AbstractOperator) -> "WeightedTranspose":
@@ -285,7 +285,7 @@ class WeightedTranspose(AbstractOperator):
         return WeightedTranspose(jnp.abs(self.weights), self.matrix.absolute())
 
     def as_matrix(self) -> Float[Array, "n l"]:
-        """Return all entries of one matrix as an array, including zeros."""
+        """Return all entries as an array, including zeros; not defined for a stack."""
         return self.weights[:, None] * self.matrix.as_matrix().T
 
     def first_columns(self, count: int) -> "WeightedTranspose":

@@ -59,10 +59,11 @@ def twists(joints: Sequence[Joint]) -> Float[np.ndarray, "n 6"]:
 
 
 def motions(joints: Sequence[Joint]) -> Float[np.ndarray, "4 n 12"]:
-    """Return the coefficients of 1, sin s, 1 - cos s and s in the pose of a joint.
+    """Return the coefficients of 1, sin s, 1 - cos s and s in the pose of each joint.
 
-    A hinge turns about its axis by Rodrigues' formula I + sin s â + (1 - cos s) â², and
-    its anchor p stays in place. Each row has the rotation and then the position.
+    Here s is the angle or the displacement of the joint. A hinge turns about its axis
+    by Rodrigues' formula I + sin s â + (1 - cos s) â², and its anchor p stays in place.
+    Each row has the rotation and then the position.
     """
     found = np.zeros((4, len(joints), 12))
     for number, joint in enumerate(joints):

@@ -126,9 +126,10 @@ Linearised = Callable[[StageUnknowns], StageResiduals]
 class FullFactors(eqx.Module):
     """The factors of the Jacobian of all stage equations.
 
-    The unknowns of the multipliers are h δy of the closure, h δΛ of the holonomic
-    constraints and, with the symmetric closure, h δλ_c at the end of the step. A change
-    h δλ_c includes the change of y that leaves the nodes unchanged to leading order.
+    The unknowns for the multipliers are h δy and h δΛ, the changes of `closure` and
+    `holonomic` in `StageUnknowns` times h. With the symmetric closure there is also
+    h δλ_c at the end of the step. A change h δλ_c includes the change of y that leaves
+    the nodes unchanged to leading order.
     """
 
     step: LinearisedStep
@@ -353,8 +354,8 @@ class StageJacobianFactors(eqx.Module):
     closure, the sign with which its unknown ν enters the last multiplier matters too;
     see `docs/closures.md`.
 
-    With `first_order`, the terms of order h are added to N⁻¹ r. The changes of the
-    unknowns with the multipliers are then the `responses`, which include these terms.
+    With `first_order`, the terms of order h are added to N⁻¹ r. The changes that
+    multipliers cause are then stored as `responses`, which include these terms.
     With `full`, the factors of the full Jacobian replace all other fields except
     `impulses`.
     """

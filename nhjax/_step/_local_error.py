@@ -17,9 +17,9 @@ samples determine this factor, so that
     U_{p+1} ≈ U_s r^(p+1-s).
 
 In an oscillation the rate of u, and with it U_1, passes through zero twice in each
-period, and so does U_3. The ratio of U_3 and U_1 still determines r. Where only U_3
-vanishes, the ratio of U_2 and U_1 is used. This ratio grows near a zero of U_1, and is
-therefore limited by the growth that earlier steps have shown.
+period, and so does U_3. The ratio of U_3 and U_1 still determines r. Where U_3
+vanishes but U_1 does not, the ratio of U_2 and U_1 is used. This ratio grows near a
+zero of U_1, and is therefore limited by the growth that earlier steps have shown.
 
 On a group, displacements are differentiated in a chart, in which each further
 derivative adds a commutator with the velocity, so that

@@ -707,8 +707,8 @@ class _Memory:
     In divergent scratch memory the values of one number for all members are side by
     side, so that a load with a uniform index loads one vector. In a batched operand and
     in a result, all numbers of one member are followed by all numbers of the next
-    member, as in JAX's arrays. Their loads and stores are therefore gathers and
-    scatters.
+    member, as in JAX's arrays. Loads and stores in batched operands and results
+    are therefore gathers and scatters.
     """
 
     def __init__(self, writer: Writer, buffers: list[Buffer]):

@@ -82,7 +82,7 @@ def _div(writer: Writer, node: Node, width: int, args: list[str]) -> str:
 def _integer_division(writer: Writer, node: Node, width: int, args: list[str]) -> str:
     """Divide integers; the results are XLA's also for divisors that may trap in LLVM.
 
-    These divisors are zero, and -1 if the quotient overflows.
+    The divisor 0 may trap, and so may -1 if the quotient overflows.
     """
     a, b = args
     divisor, signed = node.args[1], is_signed(node.dtype)

@@ -49,10 +49,9 @@ ARITHMETIC_AND_SHAPES = (*ELEMENTWISE, *_REDUCING, *_SHAPING, *_MOVING)
 _ARITHMETIC = {"add", "add_any", "div", "mul", "neg", "sub"}
 # nhjax's own operation, which is lowered to broadcasts, a product and a sum.
 SMALL_PRODUCT = "small_product"
-# nhjax's own operation, which inverts a matrix. XLA computes it by a loop of arithmetic
-# with the whole matrix.
+# nhjax's own operation, which inverts a matrix. Its parameter is the program by which
+# XLA computes it.
 SMALL_INVERSE = "small_inverse"
-_SMALL = (SMALL_PRODUCT, SMALL_INVERSE)
 # nhjax's own operation, which writes a row of an array.
 WRITE_ROW = "write_row"
 # nhjax's own operation, which calls a program. The program and its derivatives are
@@ -73,6 +72,7 @@ _CONTAINING = [
     "cond",
     "custom_linear_solve",
     "cpu_kernel",
+    SMALL_INVERSE,
     "scan",
     "while",
 ]
@@ -98,7 +98,7 @@ def _fits_one_kernel(equation: Any) -> bool:
     if name.startswith("reduce_") and _size(equation.invars[0]) > LARGEST_REDUCTION:
         return False
     small = all(_size(x) <= LARGEST_ARRAY for x in equation.outvars)
-    return small and name in (*ELEMENTWISE, *_REDUCING, *_SHAPING, *_SMALL)
+    return small and name in (*ELEMENTWISE, *_REDUCING, *_SHAPING, SMALL_PRODUCT)
 
 
 def _terms(product: Any) -> int:
@@ -147,8 +147,6 @@ def _arithmetic_sizes(program: Any, depth: int) -> Iterator[tuple[int, int]]:
         name = equation.primitive.name
         if name in _ARITHMETIC:
             yield _size(equation.outvars[0]), depth
-        if name == SMALL_INVERSE:
-            yield _size(equation.outvars[0]), depth + 1
         if name == SMALL_PRODUCT:
             for size in _sizes_of_product(equation):
                 yield size, depth
@@ -177,7 +175,14 @@ def num_results(program: Any) -> int:
 # Repeated operations are removed only if they are in this set. They have no state
 # (unlike random numbers), and no parameters that a user chooses.
 _REPEATABLE = frozenset(
-    (*ARITHMETIC_AND_SHAPES, "dot_general", "gather", KEPT_CALL, *_SMALL)
+    (
+        *ARITHMETIC_AND_SHAPES,
+        "dot_general",
+        "gather",
+        KEPT_CALL,
+        SMALL_PRODUCT,
+        SMALL_INVERSE,
+    )
 )
 # The operations whose inner programs are simplified, and the parameters that hold these
 # programs. The inner programs of other operations are not simplified, because the rules

@@ -66,7 +66,7 @@ def check_choice(argument: str, value: str, choices: Iterable[str]) -> None:
 
 
 def check_stages(stages: Sequence[int]) -> None:
-    """Raise unless the Lobatto pairs exist for all numbers of stages."""
+    """Raise unless `stages` has distinct numbers for which Lobatto pairs exist."""
     check_distinct("stages", stages)
     for s in stages:
         if s < 2:

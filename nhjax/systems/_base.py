@@ -102,7 +102,8 @@ def given_forces(
     try:
         forces = jnp.asarray(args, dtype)
     except (TypeError, ValueError):
-        # `args` has no numbers, or parts of different shapes.
+        # `args` contains something that is not a number, or its parts have different
+        # shapes.
         forces = None
     if forces is None or forces.shape != shape:
         raise ShapeError(

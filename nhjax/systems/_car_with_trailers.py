@@ -24,8 +24,9 @@ from ._planar import direction
 class CarWithTrailers(AbstractNonholonomicExample):
     """A car that pulls n trailers, each with one axle, on R⁴⁺ⁿ.
 
-    L = Σ ½ m |ċ|² + ½ I θ̇² over the car (i = 0) and its trailers, + ½ J (θ̇₀ + δ̇)²,
+    L = Σ (m_i/2 |ċ_i|² + I_i/2 θ̇_i²) + J/2 (θ̇₀ + δ̇)²,
 
+    summed over the car (i = 0) and its trailers, with the centres of mass c_i and
     q = (x, y, θ₀, δ, θ₁ ... θₙ): the middle of the rear axle [m], the heading of the
     car, the steer angle of the front wheels relative to the car, and the headings of
     the trailers [rad]. The wheels do not slip sideways. With the unit vectors e(θ)

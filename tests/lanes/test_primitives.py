@@ -308,7 +308,7 @@ def test_lanes_primitives_in_kernels_all_have_cases():
         *_jaxprs._SHAPING,
         *_jaxprs._MOVING,
         *_jaxprs._CONTAINING,
-        *_jaxprs._SMALL,
+        _jaxprs.SMALL_PRODUCT,
     ]
     assert set(names) <= set(_CASES)
 
