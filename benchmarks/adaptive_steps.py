@@ -47,7 +47,7 @@ from ._report import least_time, markdown_table, number, RESULTS, write
 
 
 LAST_BETA = 1e-3
-PARTS = "cases", "limits", "long", "stages", "tolerance"
+PARTS = "cases", "limits", "long", "rattleback", "stages", "tolerance"
 DOCS = Path(__file__).parent.parent / "docs"
 SAVED = RESULTS / "adaptive_steps.json"
 
@@ -626,6 +626,61 @@ def measure_long() -> tuple[str, dict[str, Any]]:
     return text + markdown_table(header, table), {"long": table}
 
 
+STONE_TIME = 1000.0
+STONE_STEPS = (10**6, 5 * 10**5, 25 * 10**4)
+STONE_EPS = (0.3, 0.6, 1.0)
+
+
+def measure_rattleback() -> tuple[str, dict[str, Any]]:
+    """Measure the energy of a rattleback that reverses many times."""
+    stone = systems.Rattleback.spinning(5.0, (0.5, 0.5))
+    system, y0 = stone.system, stone.initial_state()
+    start, kinetic = float(system.energy(0.0, y0)), float(0.5 * y0.p @ y0.v)
+
+    @eqx.filter_jit
+    def run(options: dict[str, Any]) -> nhjax.Solution:
+        return nhjax.integrate(
+            system,
+            nhjax.LobattoIIIAB(3),
+            y0,
+            saveat=nhjax.SaveAt(fn=lambda t, y, args: system.energy(t, y), t1=True),
+            throw=False,
+            stage_solver=nhjax.SimplifiedNewton(fallback=False),
+            **options,
+        )
+
+    table = []
+
+    def measure_run(name: str, **options: Any) -> None:
+        sol, seconds = timed(lambda: run(options))
+        error = abs(float(sol.ys[-1]) - start) / kinetic
+        steps = int(sol.stats["num_steps"])
+        if not bool(sol.result == nhjax.RESULTS.successful):
+            error = math.nan
+        table.append([name, str(steps), number(error), f"{seconds:.1f}"])
+        print(table[-1], flush=True)
+
+    for count in STONE_STEPS:
+        measure_run(
+            "constant", dt=jnp.asarray(STONE_TIME / count), num_steps=jnp.asarray(count)
+        )
+    for eps in STONE_EPS:
+        controller = nhjax.ReversibleController(jnp.asarray(eps))
+        measure_run(
+            f"reversible, ε = {eps:g}",
+            t1=STONE_TIME,
+            stepsize_controller=controller,
+            max_steps=10**8,
+        )
+    text = (
+        f"## A rattleback over {STONE_TIME:g} s\n\n"
+        "The error of the energy at the end, relative to the kinetic energy at the "
+        "start, s = 3. The density of the reversible controller is automatic.\n\n"
+    )
+    header = ["steps", "number", "energy error", "s"]
+    return text + markdown_table(header, table), {"rattleback": table}
+
+
 # --- The number of stages -------------------------------------------------------------
 
 STAGE_CASES = ("particle", "chaotic", "CVT", "orbit with close passes")
@@ -733,16 +788,19 @@ def measure_tolerances() -> tuple[str, dict[str, Any]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", nargs="*", help="words of the names of cases")
+    parser.add_argument(
+        "--only", nargs="*", help="words of the names of cases; keep the other rows"
+    )
     parser.add_argument("--parts", nargs="*", default=PARTS)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     saved = json.loads(SAVED.read_text()) if SAVED.exists() else {}
     data: dict[str, Any] = {"texts": {}} | saved
     measured = {
-        "cases": lambda: measure_cases(options.only),
+        "cases": lambda: measure_cases(options.only, saved.get("rows", [])),
         "limits": measure_limits,
         "long": measure_long,
+        "rattleback": measure_rattleback,
         "stages": measure_stages,
         "tolerance": measure_tolerances,
     }
@@ -753,13 +811,20 @@ def main() -> None:
     write("adaptive_steps", "Steps that adapt", "\n\n".join(texts), data)
 
 
-def measure_cases(only: list[str] | None) -> tuple[str, dict[str, Any]]:
-    """Measure the cases whose names contain one of the words, or all of them."""
+def measure_cases(
+    only: list[str] | None, saved: list[dict[str, Any]]
+) -> tuple[str, dict[str, Any]]:
+    """Measure the cases whose names contain one of the words, or all of them.
+
+    The saved rows of the other cases are kept.
+    """
     rows: list[Row] = []
     for name, make in CASES.items():
         if only and not any(word in name for word in only):
-            continue
-        rows += measure(name, make())
+            kept = [x for x in saved if x["case"] == name]
+            rows += [Row(**(x | {"error": x["error"] or math.nan})) for x in kept]
+        else:
+            rows += measure(name, make())
     text = markdown_table(HEADER, comparison(rows))
     details = [
         [

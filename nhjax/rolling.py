@@ -292,8 +292,9 @@ class Heightfield(eqx.Module):
             )
         import scipy.ndimage
 
-        # Mirroring at the border causes an error of the spline that falls by the factor
-        # 0.268 with each row: 32 extra rows remove it. Two rows outside of the grid are
+        # Mirroring at the border causes an error of the spline, which is smaller by a
+        # factor of 0.268 in each further row. With 32 extra rows it is below round-off
+        # in the grid. Two rows outside of the grid are
         # kept, which are enough to evaluate the spline at the border of the grid.
         padded = np.pad(given, 32, mode="reflect", reflect_type="odd")
         spline = scipy.ndimage.spline_filter(padded, order=3, mode="mirror")

@@ -437,6 +437,29 @@ def test_cost_of_redundant_constraints_quoted_agrees_with_the_result():
     assert_agree(quoted(page("robots"), sentence), measured)
 
 
+def test_limits_of_adapting_quoted_agree_with_the_result():
+    found, text = results("adaptive_steps"), page("step_sizes")
+    limits = {row["case"]: row["cancelling"] for row in found["limits"]}
+
+    def steps(case, method, error):
+        runs = [x for x in found["rows"] if (x["case"], x["method"]) == (case, method)]
+        known = sorted((x["error"], x["steps"]) for x in runs if x["error"] is not None)
+        errors, counts = np.log(np.array(known).T)
+        assert errors[0] <= np.log(error) <= errors[-1]
+        return np.exp(np.interp(np.log(error), errors, counts))
+
+    def ratio(case, method, error):
+        return steps(case, method, error) / steps(case, "constant", error)
+
+    for label, least, taken in rows_of(text, "motion", "least number"):
+        case, error = label.split(", error ")
+        assert_agree([least], [limits[case]])
+        assert_agree([taken], [ratio(case, "PID", float(error))])
+    sentence = "needs {} times the number of constant steps for an error of 1e-6"
+    stone = ratio("rattleback that reverses", "reversible", 1e-6)
+    assert_agree(quoted(text, sentence), [stone])
+
+
 def test_times_of_first_calls_agree_with_the_result():
     stored = {
         f"{row['system']}, {row['kind']}": row

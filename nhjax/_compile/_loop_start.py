@@ -26,7 +26,7 @@ loop_start.is_high = never_high
 
 
 def started_like(first: T, carry: T) -> T:
-    """Return `carry`, the carry of a loop that started from `first` and is continued.
+    """Return `carry`, from which a loop continues that had the initial carry `first`.
 
     Where a number of `first` is a constant of the program, and the loop does not change
     this number, the compiler uses the constant. The values in `carry` must come from

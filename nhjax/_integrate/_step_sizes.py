@@ -386,10 +386,10 @@ class PIDController(AbstractStepSizeController):
     ) -> tuple[FloatScalar, Memory, RESULTS]:
         """Return `dt` or, if None, a size that changes the state by one percent."""
         # Before the first step there are no earlier errors, sizes and growth rates. The
-        # errors are taken as one, the size as zero, so that no trend is predicted, and
-        # the growth rates as infinite, which means unknown.
-        one = jnp.ones((), t.dtype)
-        memory = one, one, jnp.zeros((), t.dtype), jnp.full(2, jnp.inf, t.dtype)
+        # logarithms of the errors are taken as zero, the size as zero, so that no trend
+        # is predicted, and the growth rates as infinite, which means unknown.
+        zero = jnp.zeros((), t.dtype)
+        memory = zero, zero, zero, jnp.full(2, jnp.inf, t.dtype)
         if context.dt is not None:
             size = jnp.abs(context.dt)
         else:
@@ -475,25 +475,23 @@ class PIDController(AbstractStepSizeController):
             jnp.asarray(x, dtype) for x in (self.factormin, self.factormax, self.safety)
         )
         estimate = jnp.where(is_known, error, jnp.inf)
-        # An error below this bound already gives the largest factor. The bound keeps
-        # the error positive, so that its negative powers are finite.
-        bound = (safety / most) ** number
-        error = jnp.maximum(error, jnp.maximum(bound, float(jnp.finfo(dtype).tiny)))
-        factor = (
-            safety
-            * error ** (-(p + i + d) / number)
-            * last ** ((p + 2 * d) / number)
-            * before_last ** (-d / number)
-        )
+        # Sums of logarithms take less time than products of powers. An error below this
+        # bound already gives the largest factor.
+        bound = number * jnp.log(safety / most)
+        error = jnp.log(jnp.maximum(error, float(jnp.finfo(dtype).tiny)))
+        error = jnp.maximum(error, bound)
+        powers = (p + i + d) * error - (p + 2 * d) * last + d * before_last
+        factor = -powers / number
         # If errors grow, the next size is reduced in advance. Without this, a quarter
         # of the steps of an orbit with close passes were rejected. A very small earlier
         # error may be due to chance.
-        growth = jnp.maximum(last, 0.01) / error
-        change = size / jnp.where(last_size > 0, last_size, size)
-        trend = change * growth ** (1 / number)
-        is_trend = accepted & (error > bound) & (trend < 1)
-        predicted = safety * error ** (-1 / number) * trend
+        growth = jnp.maximum(last, np.log(0.01)) - error
+        change = jnp.log(size / jnp.where(last_size > 0, last_size, size))
+        trend = change + growth / number
+        is_trend = accepted & (error > bound) & (trend < 0)
+        predicted = trend - error / number
         factor = jnp.where(is_trend, jnp.minimum(factor, predicted), factor)
+        factor = safety * jnp.exp(factor)
         factor = jnp.clip(factor, least, jnp.where(accepted, most, safety))
         factor = jnp.where(is_known, factor, least)
         following = self._limited(size * factor)
@@ -528,8 +526,8 @@ class PIDController(AbstractStepSizeController):
         if context.dt is not None:
             # Earlier errors and sizes say nothing about a size that the user gives.
             *_, growth_rates = memory
-            one = jnp.ones((), size.dtype)
-            memory = one, one, jnp.zeros_like(one), growth_rates
+            zero = jnp.zeros((), size.dtype)
+            memory = zero, zero, zero, growth_rates
             size = context.dt
         size = jnp.abs(size)
         size = jax.lax.stop_gradient(self._limited(size))

@@ -254,8 +254,8 @@ class InvariantCorrection(eqx.Module):
     Unless x is small, a is 1 up to round-off. At rest x vanishes, and no impulse can
     keep I.
 
-    With an indefinite mass matrix, G can also be singular away from rest. Then a = 0
-    for all functions; see `LEAST_PART`.
+    With an indefinite mass matrix, G can also be singular away from rest. In such
+    steps a = 0 for all kept functions; see `LEAST_PART`.
 
     - `errors`: a / g, the factor of the errors.
     - `rest`: 1 - a.
