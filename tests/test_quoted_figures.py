@@ -275,16 +275,16 @@ def test_invariant_costs_and_errors_quoted_agree_with_the_result():
     rows, text = found["rows"], page("invariants")
     kept = [row["energy"][1] for row in rows]
     sentence = (
-        "largest relative error is {} (…). In plain runs it is between {} and {} "
-        "(Suslov's problem in a potential, s = 2, t = 1e5). Constraints are violated "
-        "by at most {}, as in plain runs."
+        "largest relative error is {} (…). In plain runs it is between {} and {}; the "
+        "value {} is that of Suslov's problem in a potential with s = 2, t = 1e5. "
+        "Constraints are violated by at most {}, as in plain runs."
     )
     plain = [row["energy"][0] for row in rows]
     worst = max(rows, key=lambda row: row["energy"][0])
     assert (worst["stages"], worst["duration"]) == (2, 1e5)
     assert worst["system"].startswith("Suslov")
     violation = max(max(row["violation"]) for row in rows)
-    measured = [max(kept), min(plain), max(plain), violation]
+    measured = [max(kept), min(plain), max(plain), max(plain), violation]
     assert_agree(quoted(text, sentence), measured)
     sweeps = [row["iterations"][1] - row["iterations"][0] for row in rows]
     sentence = "A step takes between {} sweeps fewer and {} sweeps more"
@@ -458,6 +458,19 @@ def test_limits_of_adapting_quoted_agree_with_the_result():
     sentence = "needs {} times the number of constant steps for an error of 1e-6"
     stone = ratio("rattleback that reverses", "reversible", 1e-6)
     assert_agree(quoted(text, sentence), [stone])
+
+
+def test_parts_of_first_calls_quoted_agree_with_the_result():
+    stored = {
+        (row["kind"], str(row["stages"])): row
+        for row in results("compile_time")["rows"]
+        if row["system"] == "bicycle"
+    }
+    for kind, stages, *cells in rows_of(page("performance"), "call", "stages", "trace"):
+        row = stored[kind, stages]
+        trace, lower, _ = row["seconds"]
+        llvm, total = row["llvm"], sum(row["seconds"])
+        assert_agree(cells, [trace, lower - llvm, llvm, total])
 
 
 def test_times_of_first_calls_agree_with_the_result():
