@@ -441,15 +441,16 @@ def test_limits_of_adapting_quoted_agree_with_the_result():
     found, text = results("adaptive_steps"), page("step_sizes")
     limits = {row["case"]: row["cancelling"] for row in found["limits"]}
 
-    def steps(case, method, error):
+    def at_error(case, method, error, what="steps"):
         runs = [x for x in found["rows"] if (x["case"], x["method"]) == (case, method)]
-        known = sorted((x["error"], x["steps"]) for x in runs if x["error"] is not None)
+        known = sorted((x["error"], x[what]) for x in runs if x["error"] is not None)
         errors, counts = np.log(np.array(known).T)
         assert errors[0] <= np.log(error) <= errors[-1]
         return np.exp(np.interp(np.log(error), errors, counts))
 
-    def ratio(case, method, error):
-        return steps(case, method, error) / steps(case, "constant", error)
+    def ratio(case, method, error, what="steps"):
+        ours, constant = (at_error(case, x, error, what) for x in (method, "constant"))
+        return ours / constant
 
     for label, least, taken in rows_of(text, "motion", "least number"):
         case, error = label.split(", error ")
@@ -458,6 +459,13 @@ def test_limits_of_adapting_quoted_agree_with_the_result():
     sentence = "needs {} times the number of constant steps for an error of 1e-6"
     stone = ratio("rattleback that reverses", "reversible", 1e-6)
     assert_agree(quoted(text, sentence), [stone])
+    smooth = [
+        ratio(case, "PID", error, "seconds")
+        for case in ("particle", "chaotic", "CVT")
+        for error in (1e-6, 1e-8)
+    ]
+    times = quoted(text, "a run with `PIDController` takes {} to {} times as long")
+    assert_agree(times, [min(smooth), max(smooth)])
 
 
 def test_parts_of_first_calls_quoted_agree_with_the_result():
