@@ -1,5 +1,6 @@
 """The controllers of step sizes, the option `stepsize_controller` of `integrate`."""
 
+import math
 from abc import abstractmethod
 from typing import Any, NamedTuple, TypeAlias
 
@@ -485,7 +486,7 @@ class PIDController(AbstractStepSizeController):
         # If errors grow, the next size is reduced in advance. Without this, a quarter
         # of the steps of an orbit with close passes were rejected. A very small earlier
         # error may be due to chance.
-        growth = jnp.maximum(last, np.log(0.01)) - error
+        growth = jnp.maximum(last, math.log(0.01)) - error
         change = jnp.log(size / jnp.where(last_size > 0, last_size, size))
         trend = change + growth / number
         is_trend = accepted & (error > bound) & (trend < 0)
