@@ -1,4 +1,4 @@
-"""Functions of the benchmarks that measure times, and write and read reports."""
+"""Functions of the benchmarks that measure runs, and write and read reports."""
 
 import argparse
 import datetime
@@ -14,6 +14,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 import nhjax
 
@@ -33,6 +34,13 @@ def least_time(
         jax.block_until_ready(call())
         times.append(clock() - start)
     return min(times)
+
+
+def end_of(sol: nhjax.Solution) -> np.ndarray:
+    """Return (q, v) at the end of a run, or NaN if it failed."""
+    end = jax.tree.map(lambda x: x[-1], sol.ys)
+    y = np.asarray(ravel_pytree((end.q, end.v))[0])
+    return y if sol.result == nhjax.RESULTS.successful else np.full_like(y, np.nan)
 
 
 def from_fresh_process(

@@ -15,9 +15,10 @@ rejected steps. Times are the least of three calls. All programs are compiled by
 comparison at equal error, the steps of a ladder (the runs of one method with different
 steps or tolerances) are interpolated in logarithms.
 
-There are four more parts. `limits` computes how many steps ideal sizes would
-need. `long` follows the energy of the orbit over t = 1e5 with
-constant, PID and reversible steps, and draws docs/step_sizes.png. `stages` measures
+There are five more parts. `limits` computes the least number of steps with the same
+error. `long` follows the energy of the orbit over t = 1e5 with
+constant, PID and reversible steps, and draws docs/step_sizes.png. `rattleback` follows
+the energy of a rattleback over 1000 s. `stages` measures
 which number of stages reaches a given error fastest. `tolerance` compares errors
 with tolerances for machines of the gallery, and draws docs/tolerances.png.
 """
@@ -43,7 +44,7 @@ import nhjax
 from nhjax import systems
 
 from . import rolling
-from ._report import least_time, markdown_table, number, RESULTS, write
+from ._report import end_of, least_time, markdown_table, number, RESULTS, write
 
 
 LAST_BETA = 1e-3
@@ -192,13 +193,6 @@ class Row(NamedTuple):
 def timed(call: Callable[[], Any]) -> tuple[Any, float]:
     """Call once to compile, and then three times; return the result and least time."""
     return jax.block_until_ready(call()), least_time(call, 3)
-
-
-def end_of(sol: nhjax.Solution) -> np.ndarray:
-    """Return (q, v) at the end of a run, or NaN if it failed."""
-    end = jax.tree.map(lambda x: x[-1], sol.ys)
-    y = np.asarray(ravel_pytree((end.q, end.v))[0])
-    return y if sol.result == nhjax.RESULTS.successful else np.full_like(y, np.nan)
 
 
 def reference(case: Case) -> np.ndarray:
@@ -436,7 +430,7 @@ HEADER = [
 ]
 
 
-# --- What an ideal choice of sizes would need -----------------------------------------
+# --- The least number of steps --------------------------------------------------------
 
 # The numbers of constant steps that have errors of about 1e-4, or 1e-7 for the bicycle.
 LIMIT_STEPS = {
@@ -503,7 +497,7 @@ def limits(case: Case, count: int) -> Limits:
         transported.append(transport @ error)
         transport = transport @ jacobian
     sizes = np.max(np.abs(transported), axis=1)
-    k = 2 * case.stages - 1
+    k = method.order + 1
     adding = (np.mean(sizes ** (1 / k)) ** k / np.mean(sizes)) ** (1 / (k - 1))
     cancellation = float(np.max(np.abs(np.sum(transported, axis=0))) / np.sum(sizes))
     return Limits(cancellation, adding, adding / cancellation ** (1 / (k - 1)))
@@ -518,7 +512,7 @@ def measure_limits() -> tuple[str, dict[str, Any]]:
         rows.append({"case": name, "steps": count, **found._asdict()})
         table.append([name, str(count), *(f"{x:.2g}" for x in found)])
     text = (
-        "## What an ideal choice of sizes would need\n\n"
+        "## The least number of steps\n\n"
         "From the errors of constant steps, transported to the end: the size of their "
         "sum over the sum of their sizes, and the least number of steps with the same "
         "error at the end, relative to the number of constant steps.\n\n"
@@ -613,7 +607,9 @@ def measure_long() -> tuple[str, dict[str, Any]]:
         fifths = np.array_split(errors, 5)
         table.append([name, str(count), *(number(np.max(x)) for x in fifths)])
     ax.set(xlabel="t", ylabel="|E / E₀ - 1|", ylim=(1e-9, 10))
-    ax.legend(loc="upper left", markerscale=4, fontsize="small")
+    ax.legend(
+        loc="center right", bbox_to_anchor=(1.0, 0.6), markerscale=4, fontsize="small"
+    )
     figure.savefig(DOCS / "step_sizes.png", dpi=150)
     header = ["steps", "number", *(f"fifth {k}" for k in range(1, 6))]
     text = (
@@ -817,11 +813,8 @@ def measure_cases(
     rows: list[Row] = []
     for name, make in CASES.items():
         if only and not any(word in name for word in only):
-            kept = [x for x in saved if x["case"] == name]
-            known: list[dict[str, Any]] = [
-                x | {"error": x["error"] or math.nan} for x in kept
-            ]
-            rows += [Row(**x) for x in known]
+            kept = (x for x in saved if x["case"] == name)
+            rows += [Row(**x)._replace(error=x["error"] or math.nan) for x in kept]
         else:
             rows += measure(name, make())
     text = markdown_table(HEADER, comparison(rows))

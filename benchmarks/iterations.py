@@ -27,7 +27,7 @@ import numpy as np
 import nhjax
 from nhjax import systems
 
-from ._report import least_time, markdown_table, RESULTS, write
+from ._report import end_of, least_time, markdown_table, RESULTS, write
 
 
 NUM_STEPS = 20
@@ -245,14 +245,6 @@ def errors_table(names: list[str] | None) -> list[dict[str, Any]]:
     return data
 
 
-def end_of(sol: nhjax.Solution) -> np.ndarray:
-    """Return (q, v) at the end of a run, or NaN if it failed."""
-    end = np.concatenate(
-        [np.ravel(x[-1]) for x in jax.tree.leaves((sol.ys.q, sol.ys.v))]
-    )
-    return end if sol.result == nhjax.RESULTS.successful else np.full_like(end, np.nan)
-
-
 def time_to_error(
     system: Any, y0: nhjax.State, first: int, exact: np.ndarray, jacobian: Any
 ) -> dict[str, Any]:
@@ -281,14 +273,14 @@ def time_to_error(
         if error <= LARGEST_ERROR * np.max(np.abs(exact)):
             break
     # A batch takes only the first steps of a long run.
-    first = min(count, 500)
-    few = given[0], jnp.asarray(first)
+    num_first = min(count, 500)
+    few = given[0], jnp.asarray(num_first)
     jax.block_until_ready(batch(starts, *few))
     return {
         "steps": count,
         "iterations": float(sol.stats["num_iterations"]) / count,
         "single": least_time(lambda: run(y0, *given), 5),
-        "batch": least_time(lambda: batch(starts, *few), 3) * count / first,
+        "batch": least_time(lambda: batch(starts, *few), 3) * count / num_first,
     }
 
 

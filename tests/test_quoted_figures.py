@@ -481,6 +481,29 @@ def test_parts_of_first_calls_quoted_agree_with_the_result():
         assert_agree(cells, [trace, lower - llvm, llvm, total])
 
 
+def test_times_with_the_full_jacobian_quoted_agree_with_the_result():
+    found, text = results("iterations"), page("solvers")
+    (row,) = (
+        x for x in found["rows"] if (x["name"], x["stages"]) == ("bicycle, 4.6 m/s", 3)
+    )
+    full, default = row["full"], row["default"]
+    more = full["first_call"] - default["first_call"]
+    sentence = (
+        "takes {} µs with the full Jacobian and {} µs with the default one, but the "
+        "first call takes {} s longer"
+    )
+    assert_agree(quoted(text, sentence), [full["us"], default["us"], more])
+    sentence = (
+        "take {} times as long for the bicycle, {} times for the four-bar linkage, {} "
+        "times for the torus and {} times for the rattleback"
+    )
+    ratios = {
+        x["name"]: x["full"]["single"] / x["default"]["single"] for x in found["errors"]
+    }
+    names = "bicycle, 4.6 m/s", "FourBar", "RollingTorus", "Rattleback"
+    assert_agree(quoted(text, sentence), [ratios[name] for name in names])
+
+
 def test_times_of_first_calls_agree_with_the_result():
     stored = {
         f"{row['system']}, {row['kind']}": row

@@ -138,16 +138,13 @@ def _inverse_by_rows(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
     size = matrix.shape[0]
     numbers = jnp.arange(size, dtype=jnp.int32)
 
-    def entry(table, i, k):
-        return jax.lax.dynamic_slice(table, (i, k), (1, 1))[0, 0]
-
     def eliminate(k, carry):
         table, order = carry
 
         def compare(offset, found):
             _, _, largest, _ = found
             i = k + offset
-            value = entry(table, i, k)
+            value = _entry(table, i, k)
             # As in `argmax`, NaN is the largest magnitude.
             is_larger = ~(jnp.abs(value) <= largest) & ~jnp.isnan(largest)
             new = i, value, jnp.abs(value), _taken(table, i)
@@ -162,11 +159,11 @@ def _inverse_by_rows(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
         place = jnp.sum(jnp.where(is_pivot, order, 0), dtype=order.dtype)
         order = jnp.where(is_pivot, _taken(order, k), order)
         order = jnp.where(is_k, place, order)
-        first = entry(table, k, k)
+        first = _entry(table, k, k)
 
         def reduce_row(i, table):
             # Exchange the rows k and `best`.
-            factor = jnp.where(i == best, first, entry(table, i, k))
+            factor = jnp.where(i == best, first, _entry(table, i, k))
             rest = jnp.where(i == best, row, _taken(table, i))
             # Replace column k by the column of the inverse.
             reduced = jnp.where(is_k, 0, rest) - factor * scaled
@@ -179,7 +176,7 @@ def _inverse_by_rows(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
     def in_place(i):
         def add(k, row):
             is_place = _taken(order, k) == numbers
-            return row + jnp.where(is_place, entry(table, i, k), 0)
+            return row + jnp.where(is_place, _entry(table, i, k), 0)
 
         return repeated(size, add, jnp.zeros_like(table[0]))
 
@@ -271,25 +268,22 @@ def solve_by_rows(
         lambda i: jnp.concatenate([_taken(matrix, i), _taken(rights, i)]), numbers
     )
 
-    def entry(table, i, k):
-        return jax.lax.dynamic_slice(table, (i, k), (1, 1))[0, 0]
-
     def eliminate(k, table):
         def compare(i, found):
             best, largest = found
-            value = jnp.abs(entry(table, i, k))
+            value = jnp.abs(_entry(table, i, k))
             is_larger = (i >= k) & (value > largest)
             return jnp.where(is_larger, i, best), jnp.where(is_larger, value, largest)
 
         none = -jnp.ones((), table.dtype)
         best, _ = repeated(size, compare, (k, none))
         pivot_row, row = _taken(table, best), _taken(table, k)
-        table = _put(_put(table, row, best), pivot_row / entry(table, best, k), k)
+        table = _put(_put(table, row, best), pivot_row / _entry(table, best, k), k)
         scaled = _taken(table, k)
 
         def reduce_row(offset, table):
             i = k + 1 + offset
-            factor = entry(table, i, k)
+            factor = _entry(table, i, k)
             return _put(table, _taken(table, i) - factor * scaled, i)
 
         return repeated(size - 1 - k, reduce_row, table)
@@ -319,6 +313,10 @@ def repeated(count: int | Array, body: Callable[[Array, Any], Any], carry: Any) 
 
 def _taken(x: Array, k: Array) -> Array:
     return jax.lax.dynamic_index_in_dim(x, k, keepdims=False)
+
+
+def _entry(x: Array, i: Array, k: Array) -> Array:
+    return jax.lax.dynamic_slice(x, (i, k), (1, 1))[0, 0]
 
 
 def _put(x: Array, row: Array, k: Array) -> Array:

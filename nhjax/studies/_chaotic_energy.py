@@ -425,8 +425,8 @@ def _panel(ax: "Axes", runs: list[ChaoticRun], power: int) -> None:
         ax.plot(times, scaled, linewidth=0.4, alpha=0.35, color=f"C{i}")
         mean = _smoothed(scaled)
         ax.plot(times, mean, color=f"C{i}", linewidth=1.5, label=f"$h$ = {h:g}")
-        # Statistical errors at neighbouring times are correlated, so that the standard
-        # error of the running mean is the same as that of the value at a single time.
+        # Statistical errors at neighbouring times are correlated. Therefore the running
+        # mean is not more accurate than the value at a single time.
         ax.fill_between(
             times, mean - spread, mean + spread, color=f"C{i}", alpha=0.2, linewidth=0
         )
