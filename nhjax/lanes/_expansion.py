@@ -9,7 +9,7 @@ implementation if such an operation is called outside of transformations.
 
 import math
 from collections.abc import Callable, Container
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
@@ -21,6 +21,9 @@ from jax.extend.core.primitives import closed_call_p
 
 # Matrices with more rows than this are left to XLA, which calls LAPACK.
 MOST_ROWS = 32
+# With more rows, LAPACK computes singular values in less time, and compiling a call of
+# LAPACK takes less time too.
+_MOST_ROWS_OF_SINGULAR_VALUES = 12
 # Stacks of more matrices than this are left to XLA too, because the written-out program
 # would be long.
 _MOST_MEMBERS = 16
@@ -87,7 +90,7 @@ class _Expander:
         if primitive.name in _EXPANSIONS:
             applies, function = _EXPANSIONS[primitive.name]
             if applies(equation):
-                return _traced(partial(function, **params), equation)
+                return _expansion(function, equation)
         if primitive.name == _EXPANDED_BY_JAX:
             return _traced(partial(primitive.to_lojax, **params), equation)
         if primitive.name in self._stays or not is_foreign(primitive):
@@ -124,21 +127,49 @@ def is_foreign(primitive: Any) -> bool:
     return module.partition(".")[0] != "jax"
 
 
+def _expansion(function: Callable[..., Any], equation: Any) -> Any:
+    """Return the program of `function(*operands, **params)`, or `None`."""
+    params = equation.params
+    if any(map(_holds_programs, params.values())):
+        return _traced(partial(function, **params), equation)
+    return _known_program(function, tuple(params.items()), *_kinds(equation))
+
+
+@lru_cache(maxsize=1000)
+def _known_program(
+    function: Callable[..., Any], params: tuple[Any, ...], *kinds: Any
+) -> Any:
+    # Tracing a factorisation takes longer than tracing most functions that contain it.
+    return _program(partial(function, **dict(params)), *kinds)
+
+
 def _traced(function: Callable[..., Any], equation: Any) -> Any:
     """Return the program of an operation, or `None` if it cannot be traced."""
-    avals = [variable.aval for variable in equation.invars]
+    return _program(function, *_kinds(equation))
+
+
+def _kinds(equation: Any) -> tuple[Any, Any]:
+    """Return the kinds of the operands, and the kinds of the results."""
+    operands, results = [x.aval for x in equation.invars], equation.outvars
+    return (
+        tuple((x.shape, x.dtype, x.weak_type) for x in operands),
+        tuple((x.aval.shape, x.aval.dtype) for x in results),
+    )
+
+
+def _program(function: Callable[..., Any], operands: Any, results: Any) -> Any:
     args = [
-        jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type) for a in avals
+        jax.ShapeDtypeStruct(shape, dtype, weak_type=weak_type)
+        for shape, dtype, weak_type in operands
     ]
     try:
         program = jax.make_jaxpr(function)(*args)
     except Exception:
         # The code of another library may need concrete values, or call code that JAX
-        # cannot trace.
+        # cannot trace. The factorisations of this file need at least one row.
         return None
-    found = [(x.shape, x.dtype) for x in program.out_avals]
-    wanted = [(x.aval.shape, x.aval.dtype) for x in equation.outvars]
-    return program if found == wanted else None
+    found = tuple((x.shape, x.dtype) for x in program.out_avals)
+    return program if found == results else None
 
 
 def _contains(jaxpr: Any, primitive: Any) -> bool:
@@ -180,6 +211,17 @@ def _is_symmetric_problem(equation: Any) -> bool:
     return _is_small_matrix(equation) and equation.params["subset_by_index"] is None
 
 
+def _has_only_singular_values(equation: Any) -> bool:
+    """Return whether an operation computes singular values without vectors."""
+    params, shape = equation.params, equation.invars[0].aval.shape
+    return (
+        _is_small_matrix(equation)
+        and min(shape[-2:]) <= _MOST_ROWS_OF_SINGULAR_VALUES
+        and params["subset_by_index"] is None
+        and not params["compute_uv"]
+    )
+
+
 def _lu(a: Any, **_: Any) -> tuple[Any, Any, Any]:
     """Factorise with row exchanges, like LAPACK's `getrf`.
 
@@ -215,6 +257,37 @@ def _lu(a: Any, **_: Any) -> tuple[Any, Any, Any]:
 _MOST_SWEEPS = 16
 
 
+def _in_next_order(x: Any) -> Any:
+    """Move the rows to form other pairs, as in a round-robin tournament."""
+    if len(x) == 2:
+        return x
+    tops, bottoms = x[0::2], x[1::2]
+    tops, bottoms = (
+        jnp.concatenate([tops[:1], bottoms[:1], tops[1:-1]]),
+        jnp.concatenate([bottoms[1:], tops[-1:]]),
+    )
+    return jnp.stack([tops, bottoms], axis=1).reshape(x.shape)
+
+
+def _rotation(ratio: Any) -> Callable[[Any], Any]:
+    """Return the function that rotates pairs of rows, and then forms other pairs.
+
+    `ratio` is cot 2θ for the angle θ of each pair, with |θ| <= π/4; an infinite number
+    stands for no rotation.
+    """
+    size = jnp.abs(ratio) + jnp.sqrt(1 + ratio * ratio)
+    tangent = jnp.where(ratio < 0, -1 / size, 1 / size)
+    cosine = 1 / jnp.sqrt(1 + tangent * tangent)
+    cosine, sine = cosine[:, None], (tangent * cosine)[:, None]
+
+    def turned(x: Any) -> Any:
+        first, second = x[0::2], x[1::2]
+        pair = [cosine * first - sine * second, sine * first + cosine * second]
+        return _in_next_order(jnp.stack(pair, axis=1).reshape(x.shape))
+
+    return turned
+
+
 def _eigh(a: Any, *, lower: bool, sort_eigenvalues: bool, **_: Any) -> tuple[Any, Any]:
     """Diagonalise a symmetric matrix by Jacobi's method.
 
@@ -232,17 +305,6 @@ def _eigh(a: Any, *, lower: bool, sort_eigenvalues: bool, **_: Any) -> tuple[Any
     vectors = jnp.eye(len(a), dtype=a.dtype)
     off_diagonal = jnp.asarray(1 - np.eye(len(a)), a.dtype)
 
-    def in_next_order(x: Any) -> Any:
-        """Move the rows to form other pairs, as in a round-robin tournament."""
-        if len(x) == 2:
-            return x
-        tops, bottoms = x[0::2], x[1::2]
-        tops, bottoms = (
-            jnp.concatenate([tops[:1], bottoms[:1], tops[1:-1]]),
-            jnp.concatenate([bottoms[1:], tops[-1:]]),
-        )
-        return jnp.stack([tops, bottoms], axis=1).reshape(x.shape)
-
     def round_of_sweep(_: Any, carry: Any) -> Any:
         a, vectors = carry
         diagonal = jnp.diagonal(a)
@@ -250,17 +312,7 @@ def _eigh(a: Any, *, lower: bool, sort_eigenvalues: bool, **_: Any) -> tuple[Any
         is_zero = beside == 0
         ratio = diagonal[1::2] - diagonal[0::2]
         ratio = ratio / (2 * jnp.where(is_zero, jnp.ones_like(beside), beside))
-        size = jnp.abs(ratio) + jnp.sqrt(1 + ratio * ratio)
-        tangent = jnp.where(ratio < 0, -1 / size, 1 / size)
-        tangent = jnp.where(is_zero, jnp.zeros_like(tangent), tangent)
-        cosine = 1 / jnp.sqrt(1 + tangent * tangent)
-        cosine, sine = cosine[:, None], (tangent * cosine)[:, None]
-
-        def turned(x: Any) -> Any:
-            first, second = x[0::2], x[1::2]
-            pair = [cosine * first - sine * second, sine * first + cosine * second]
-            return in_next_order(jnp.stack(pair, axis=1).reshape(x.shape))
-
+        turned = _rotation(jnp.where(is_zero, jnp.inf, ratio))
         return turned(turned(a).T), turned(vectors)
 
     def goes_on(carry: Any) -> Any:
@@ -286,6 +338,54 @@ def _eigh(a: Any, *, lower: bool, sort_eigenvalues: bool, **_: Any) -> tuple[Any
     values, vectors = (jnp.where(is_finite, x, jnp.nan) for x in (values, vectors))
     chosen = (place[:, None] == jnp.arange(size)[None]).astype(a.dtype)
     return (chosen @ vectors[:size, :size]).T, values
+
+
+def _singular_values(a: Any, **_: Any) -> list[Any]:
+    """Compute singular values in descending order, by the one-sided Jacobi method.
+
+    Each round rotates disjoint pairs of rows to be orthogonal. At the end the singular
+    values are the lengths of the rows. Small singular values are as accurate as with
+    LAPACK or better (Demmel and Veselić, SIAM J. Matrix Anal. Appl. 13, 1992), except
+    that values can be zero if their square, relative to the square of the largest
+    entry, underflows.
+    """
+    if a.shape[0] > a.shape[1]:
+        a = a.T
+    size, width = a.shape
+    eps = float(jnp.finfo(a.dtype).eps)
+    # Products of the entries do not overflow after the division by the largest entry.
+    largest = jnp.max(jnp.abs(a))
+    scale = jnp.where(largest > 0, largest, jnp.ones_like(largest))
+    rows = jnp.pad(a / scale, ((0, size % 2), (0, 0)))
+
+    def round_of_sweep(_: Any, carry: Any) -> Any:
+        rows, cosines = carry
+        first, second = rows[0::2], rows[1::2]
+        pairs = (first, first), (second, second), (first, second)
+        one, other, mixed = [jnp.sum(x * y, axis=1) for x, y in pairs]
+        sizes = jnp.sqrt(one) * jnp.sqrt(other)
+        cosine = jnp.abs(mixed) / jnp.where(sizes > 0, sizes, jnp.ones_like(sizes))
+        is_done = cosine <= eps / 4
+        ratio = (other - one) / (2 * jnp.where(is_done, jnp.ones_like(mixed), mixed))
+        turned = _rotation(jnp.where(is_done, jnp.inf, ratio))
+        return turned(rows), jnp.maximum(cosines, jnp.max(cosine))
+
+    def sweep(carry: Any) -> Any:
+        number, rows, _ = carry
+        start = rows, jnp.zeros_like(largest)
+        return number + 1, *jax.lax.fori_loop(0, len(rows) - 1, round_of_sweep, start)
+
+    def goes_on(carry: Any) -> Any:
+        number, _, cosines = carry
+        # The rounding errors of products of rows do not let the cosines become zero.
+        return (number < _MOST_SWEEPS) & (cosines > width * eps)
+
+    start = jnp.int32(0), rows, jnp.ones_like(largest)
+    _, rows, _ = jax.lax.while_loop(goes_on, sweep, start)
+    squares = jnp.sum(rows * rows, axis=1)
+    values = jnp.where(jnp.isfinite(jnp.sum(squares)), jnp.sqrt(squares), jnp.nan)
+    (ascending,) = _sort(values, dimension=0, is_stable=True, num_keys=1)
+    return [scale * ascending[::-1][:size]]
 
 
 def _permutation(pivots: Any, *, permutation_size: int, **_: Any) -> Any:
@@ -453,6 +553,7 @@ _EXPANSIONS: dict[str, tuple[Callable[[Any], bool], Callable[..., Any]]] = {
     "lu_pivots_to_permutation": (_is_short, _for_each(_permutation, 1)),
     "nextafter": (_is_real, _nextafter),
     "platform_index": (lambda equation: True, _platform_index),
+    "svd": (_has_only_singular_values, _for_each(_singular_values, 2)),
     "sort": (_is_sort_of_few, _for_each(_sort, 1)),
     "triangular_solve": (_is_small_matrix, _for_each(_triangular_solve, 2)),
     "while": (_has_members, _while_any),

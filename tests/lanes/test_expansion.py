@@ -3,6 +3,7 @@
 import jax
 import jax.extend
 import jax.numpy as jnp
+import mpmath
 import numpy as np
 import pytest
 from jax import lax
@@ -121,6 +122,88 @@ def test_eigenvectors_in_lanes_of_a_matrix_that_is_not_finite_are_nan(number):
     a = np.array([[2.0, number, 0.0], [number, 3.0, 1.0], [0.0, 1.0, 4.0]])
     for found in lanes_run.run_batched(jnp.linalg.eigh, 4, a[None]):
         assert np.all(np.isnan(found))
+
+
+def _singular_values(a):
+    return jnp.linalg.svd(a, compute_uv=False)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 4), (2, 2), (3, 7), (7, 3), (12, 12)])
+def test_singular_values_in_lanes_equal_lapack(shape, dtype):
+    a = _matrices(*shape, dtype=dtype)
+    a[0] = np.eye(*shape)  # equal singular values
+    a[1] = np.outer(a[1, :, 0], a[1, 0])  # rank one
+    a[2] *= 1e150 if dtype == "float64" else 1e30
+    a[3] *= 1e-150 if dtype == "float64" else 1e-30
+    a[4] = 0
+    found = lanes_run.run_batched(_singular_values, 4, a)
+    for matrix, values in zip(a, found, strict=True):
+        expected = np.linalg.svd(matrix.astype(float), compute_uv=False)
+        scale = 10 * max(shape) * np.finfo(dtype).eps * expected[0]
+        np.testing.assert_allclose(values, expected, rtol=0, atol=scale)
+
+
+def test_small_singular_values_in_lanes_of_rows_of_different_size_are_accurate():
+    """LAPACK finds the small ones only up to the round-off of the largest."""
+    rows = _matrices(5, 6) * np.logspace(0, -40, 5)[:, None]
+    found = lanes_run.run_batched(_singular_values, 4, rows)
+    with mpmath.workdps(80):
+        for matrix, values in zip(rows, found, strict=True):
+            expected = mpmath.svd_r(mpmath.matrix(matrix.tolist()), compute_uv=False)
+            np.testing.assert_allclose(values, [float(x) for x in expected], rtol=1e-14)
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_singular_values_in_lanes_of_a_matrix_that_is_not_finite_are_nan(number):
+    a = np.array([[2.0, number, 0.0], [0.5, 3.0, 1.0], [0.0, 1.0, 4.0]])
+    found = lanes_run.run_batched(_singular_values, 4, a[None])
+    assert np.all(np.isnan(found))
+
+
+def test_singular_values_in_lanes_near_the_largest_number_are_finite():
+    largest = np.finfo(float).max
+    a = np.array([np.diag([largest, largest / 2]), [[largest, 0.0], [largest, 1.0]]])
+    found = lanes_run.run_batched(_singular_values, 4, a)
+    np.testing.assert_allclose(found[0], [largest, largest / 2], rtol=1e-15)
+    # The largest one is larger than every number.
+    assert found[1][0] == np.inf
+
+
+def test_singular_values_of_many_rows_are_left_to_xla():
+    """LAPACK needs less time, also with the time to compile the call."""
+    with pytest.raises(lanes.Unsupported, match="svd"):
+        lanes_run.run_batched(_singular_values, 4, _matrices(13, 20))
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        jnp.sort,
+        jnp.argsort,
+        lambda x: jnp.linalg.solve(jnp.outer(x, x), x),
+        lambda x: jnp.linalg.det(jnp.outer(x, x)),
+        lambda x: jnp.linalg.eigh(jnp.outer(x, x)),
+        lambda x: _singular_values(jnp.outer(jnp.ones(3), x)),
+        lambda x: jax.scipy.linalg.solve_triangular(jnp.outer(x, x), x),
+    ],
+    ids=["sort", "argsort", "solve", "det", "eigh", "svd", "triangular"],
+)
+def test_operations_on_empty_arrays_are_left_to_xla(function):
+    def both(x):
+        return x * 2.0, function(x[:0])
+
+    x = np.ones((5, 3))
+    found = jax.jit(lanes.vmap(both))(x)
+    expected = jax.vmap(both)(x)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_singular_vectors_are_left_to_xla():
+    a = _matrices(3, 3)
+    with pytest.raises(lanes.Unsupported, match="svd"):
+        lanes_run.run_batched(jnp.linalg.svd, 4, a)
 
 
 def test_eigenvalues_and_pseudoinverse_in_lanes_equal_jax():
