@@ -1,6 +1,7 @@
 """The exceptions that nhjax raises, and the functions that enforce conditions."""
 
 import contextlib
+import dataclasses
 import functools
 import inspect
 import logging
@@ -174,7 +175,7 @@ def require(tree: T, *checks: Check) -> T:
     The returned tree must be used afterwards: `jax.jit` drops checks whose result is
     not used.
     """
-    later = _undecided(checks)
+    later = undecided(*checks)
     if not later:
         return tree
     failed = ~jnp.stack([jnp.asarray(check.ok) for check in later])
@@ -187,13 +188,13 @@ def hold(*checks: Check) -> Bool[Array, ""] | None:
 
     If a check of concrete values fails, its exception is raised.
     """
-    later = _undecided(checks)
+    later = undecided(*checks)
     if not later:
         return None
     return jnp.all(jnp.stack([jnp.asarray(check.ok) for check in later]))
 
 
-def _undecided(checks: tuple[Check, ...]) -> list[Check]:
+def undecided(*checks: Check) -> list[Check]:
     """Return the checks of traced values; raise for the first failed concrete check."""
     later = []
     for check in checks:
@@ -232,9 +233,6 @@ def member_name(index: tuple[int, ...]) -> int | tuple[int, ...] | None:
     return index if len(index) > 1 else (index[0] if index else None)
 
 
-# This function is compiled as a whole, since an eager `vmap` would compile the
-# call-back again at each call.
-@eqx.filter_jit
 def raise_where(
     tree: T,
     bad: Bool[Array, ""],
@@ -250,27 +248,66 @@ def raise_where(
     # The same array often belongs to several checks, and is passed only once.
     leaves, treedef = jax.tree.flatten(values)
     arrays = list({id(x): x for x in leaves if eqx.is_array(x)}.values())
-    place = {id(x): i for i, x in enumerate(arrays)}
-    places = [place.get(id(leaf)) for leaf in leaves]
-    # The call-back outlives the trace, and must not refer to traced arrays.
-    dtypes = [x.dtype for x in arrays]
+    place = {id(x): _Place(i) for i, x in enumerate(arrays)}
+    described = treedef.unflatten([place.get(id(leaf), leaf) for leaf in leaves])
+    return _raise_where(tree, bad, error, arrays, described)
 
-    def on_host(bad, *bits):
-        found = [np.asarray(x).view(d) for x, d in zip(bits, dtypes, strict=True)]
-        known = [
-            leaf if place is None else found[place]
-            for leaf, place in zip(rest, places, strict=True)
+
+@dataclasses.dataclass(frozen=True)
+class _Place:
+    """The place of an array in the list of arrays that are passed to the host."""
+
+    index: int
+
+
+# This function is compiled as a whole, since an eager `vmap` would compile the
+# call-back again at each call.
+@eqx.filter_jit
+def _raise_where(
+    tree: T,
+    bad: Bool[Array, ""],
+    error: Callable[[np.ndarray, Any], Exception],
+    arrays: list[Array],
+    described: PyTree[Any],
+) -> T:
+    """Return `tree`, or raise `error`; `described` has places instead of arrays."""
+    # The call-back outlives the trace, and must not refer to traced arrays.
+    kinds = [(x.shape, x.dtype) for x in arrays]
+    packed, slices = _packed(arrays)
+
+    def on_host(bad, *packed):
+        batch = np.shape(bad)
+        found = [
+            np.asarray(packed[group])[..., part].view(dtype).reshape(batch + shape)
+            for (group, part), (shape, dtype) in zip(slices, kinds, strict=True)
         ]
-        exception = error(np.asarray(bad), treedef.unflatten(known))
+        values = jax.tree.map(
+            lambda x: found[x.index] if isinstance(x, _Place) else x, described
+        )
+        exception = error(np.asarray(bad), values)
         raise exception.with_traceback(_short_traceback())
 
-    rest = [None if eqx.is_array(leaf) else leaf for leaf in leaves]
-    passed = _one_result_of_batch(on_host)(bad, *map(_bits, arrays))
+    passed = _one_result_of_batch(on_host)(bad, *map(_bits, packed))
     # Every part of the tree must depend on the check, so that `jax.jit` keeps the
     # check.
     dynamic, static = eqx.partition(tree, eqx.is_array)
     dynamic = jax.tree.map(lambda x: jnp.where(passed, x, jnp.zeros_like(x)), dynamic)
     return eqx.combine(dynamic, static)
+
+
+def _packed(arrays: list[Array]) -> tuple[list[Array], list[tuple[int, slice]]]:
+    """Join the arrays of each dtype to a vector; return also where each array is.
+
+    XLA would compile a kernel for each array that is converted to bits.
+    """
+    groups: dict[Any, list[Array]] = {}
+    slices = []
+    for x in arrays:
+        group = groups.setdefault(x.dtype, [])
+        start = sum(y.size for y in group)
+        group.append(x.reshape(-1))
+        slices.append((list(groups).index(x.dtype), slice(start, start + x.size)))
+    return [jnp.concatenate(group) for group in groups.values()], slices
 
 
 def _bits(x: Array) -> Array:

@@ -15,7 +15,6 @@ from .._errors import (
     IrregularLagrangianError,
     NewtonError,
     NonFiniteError,
-    on_host,
 )
 from .._numerics import RankCondition
 from .._system import (
@@ -135,56 +134,61 @@ class _Case(NamedTuple):
         return f"{self.words.constraint} = {found.lin.violation}{positions}"
 
 
+def judged(found: Found) -> list[BoolScalar | np.bool_]:
+    """Return whether each condition on an initial state holds, as in `list_checks`."""
+    state, lin = found.state, found.lin
+    singular = 10 * state.v.shape[0] * jnp.finfo(state.v.dtype).eps
+    values = found.generator, found.regularity, lin.violation, found.positions
+    return [
+        found.off_group <= found.allowed_off_group,
+        # The negated "<=" lets NaN pass, since another check reports a matrix that is
+        # not finite.
+        ~(found.regularity <= singular),
+        found.legendre_solved,
+        *[~deficient for deficient in found.deficient],
+        *[all_finite(rank.jacobian) | ~rank.is_active for rank in found.ranks],
+        found.projected,
+        all_finite(values),
+        ~(found.compatibility <= singular),
+        jnp.all(jnp.abs(found.positions) <= found.allowed_positions),
+        jnp.all(jnp.abs(lin.violation) <= found.allowed),
+        all_finite((lin.acceleration, lin.multiplier)),
+    ]
+
+
 def list_checks(
     system: AbstractMechanicalSystem,
     found: Found,
+    holds: list[BoolScalar | np.bool_],
     q: PyTree[Array],
     v: Float[Array, " n"] | None,
     p: Float[Array, " n"] | None,
     project: bool,
     keep: tuple[Kept, Kept],
 ) -> list[Check]:
-    """List the conditions on an initial state, each with its exception."""
+    """List the conditions on an initial state, each with its exception.
+
+    `holds` is the result of `judged`.
+    """
     name, given = ("p", p) if v is None else ("v", v)
     words, group = _WORDS[system.generator], f"{system.manifold_of(q)}"
-    case = (_Case(found, q, name, given, project, words, group, keep),)
-    found = on_host(found)
-    state, lin = found.state, found.lin
-    singular = 10 * state.v.shape[0] * jnp.finfo(state.v.dtype).eps
+    case = _Case(found, q, name, given, project, words, group, keep)
+    errors = [
+        (_group_error, case),
+        (_regularity_error, case),
+        (_legendre_error, case),
+        *[(_dependence_error, case, rank) for rank in found.ranks],
+        *[(_derivative_error, case, rank) for rank in found.ranks],
+        (_projection_error, case),
+        (_value_error, case),
+        (_compatibility_error, case),
+        (_position_error, case),
+        (_violation_error, case),
+        (_force_error, case),
+    ]
     return [
-        Check(found.off_group <= found.allowed_off_group, _group_error, case),
-        # The negated "<=" lets NaN pass, since another check reports a matrix that is
-        # not finite.
-        Check(~(found.regularity <= singular), _regularity_error, case),
-        Check(found.legendre_solved, _legendre_error, case),
-        *[
-            Check(~deficient, _dependence_error, (*case, rank))
-            for rank, deficient in zip(found.ranks, found.deficient, strict=True)
-        ],
-        *[
-            Check(
-                all_finite(rank.jacobian) | ~rank.is_active,
-                _derivative_error,
-                (*case, rank),
-            )
-            for rank in found.ranks
-        ],
-        Check(found.projected, _projection_error, case),
-        Check(
-            all_finite(
-                (found.generator, found.regularity, lin.violation, found.positions)
-            ),
-            _value_error,
-            case,
-        ),
-        Check(~(found.compatibility <= singular), _compatibility_error, case),
-        Check(
-            (abs(found.positions) <= found.allowed_positions).all(),
-            _position_error,
-            case,
-        ),
-        Check((abs(lin.violation) <= found.allowed).all(), _violation_error, case),
-        Check(all_finite((lin.acceleration, lin.multiplier)), _force_error, case),
+        Check(ok, error, tuple(values))
+        for ok, (error, *values) in zip(holds, errors, strict=True)
     ]
 
 

@@ -1,4 +1,4 @@
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._compile import as_cpu_kernel, tracked_jit
 from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
-from .._errors import DTypeError, require, ShapeError
+from .._errors import DTypeError, on_host, require, ShapeError, undecided
 from .._numerics import (
     active_ranks,
     has_zero_row,
@@ -46,7 +46,7 @@ from .._system import (
     violation_scale,
     with_kept_functions,
 )
-from ._checks import Found, list_checks
+from ._checks import Found, judged, list_checks
 from ._projection import (
     checked_keep,
     Chosen,
@@ -55,6 +55,11 @@ from ._projection import (
     project_fibre_coordinate,
     project_position,
 )
+
+
+# The largest number of coordinates with which one kernel computes an initial state and
+# its checks.
+_LARGEST_WHOLE = 12
 
 
 def initial_state(
@@ -160,23 +165,43 @@ def initial_state(
         if x is not None
     ]
     if throw:
-        q = require(q, *inputs)
-    found = _solve(system, t, q, v, p, args, project, keep)
-    checks = list_checks(system, found, q, v, p, project, keep)
+        # Only traced inputs are checked together with the solution, in one call-back.
+        inputs = undecided(*inputs)
+    found, holds = _solve(system, t, q, v, p, args, project, keep)
+    holds = on_host(holds)
+    checks = inputs + list_checks(system, found, holds, q, v, p, project, keep)
     if throw:
         return require(found.state, *checks)
-    good = jnp.all(jnp.stack([jnp.asarray(check.ok) for check in inputs + checks]))
+    good = jnp.all(jnp.stack([jnp.asarray(check.ok) for check in checks]))
     return nan_unless(good, found.state)
 
 
 @tracked_jit("system", "args")
-def _solve(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> Found:
-    keep_u = keep[1]
+def _solve(
+    system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]
+) -> tuple[Found, list[BoolScalar | np.bool_]]:
+    """Compute the state and the numbers for its checks, and judge them."""
     system = with_kept_functions(system, t, q, p if v is None else v, args)
     given = system, t, q, v, p, args, project, keep
+    # A large program, or one that calls LAPACK as the projection with kept components
+    # does, is compiled in less time in parts.
+    keeps_any = any(kept.indices for kept in keep)
+    if keeps_any or system.manifold_of(q).dim > _LARGEST_WHOLE:
+        return _found_and_judged(*given)
+    return as_cpu_kernel(_found_and_judged, *given, is_brief=True)
+
+
+def _found_and_judged(*given: Any) -> tuple[Found, list[BoolScalar | np.bool_]]:
+    found = _found(*given)
+    return found, judged(found)
+
+
+def _found(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> Found:
+    keep_u = keep[1]
+    given = system, t, q, v, p, args, project, keep
     at = as_cpu_kernel(_project, *given, is_brief=True)
-    q, u, found_v, found_p, lin = at.q, at.u, at.v, at.p, at.lin
     projected, starts = at.projected, at.starts
+    q, u, found_v, found_p, lin = at.q, at.u, at.v, at.p, at.lin
     if not project:
         # The given velocity or momentum is returned bit for bit.
         found_v = found_v if v is None else v
@@ -410,6 +435,4 @@ def checked_inputs(system, q, v, p, t):
                 "must agree."
             )
     t = real_scalar("t", t, u.dtype)
-    # All checks are attached to q, since `jax.jit` drops a check of an unused value and
-    # every system uses q.
     return (q, u, None, t) if p is None else (q, None, u, t)

@@ -210,6 +210,38 @@ def test_initial_state_with_correct_values_does_not_call_host(transform, monkeyp
     assert not called
 
 
+def test_initial_state_in_compiled_programs_passes_few_arrays_to_host(monkeypatch):
+    """XLA compiles a kernel for each array that is passed."""
+    pure_callback, numbers = jax.pure_callback, []
+
+    def observed(function, shape, *arrays, **options):
+        numbers.append(len(arrays))
+        return pure_callback(function, shape, *arrays, **options)
+
+    monkeypatch.setattr(jax, "pure_callback", observed)
+    # A new system is traced anew.
+    system = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v - q[0])
+    q = jnp.ones((2, 3))
+    jax.make_jaxpr(jax.vmap(lambda q: nhjax.initial_state(system, q, q)))(q)
+    # The failed conditions, and the numbers of each dtype.
+    assert 1 <= max(numbers) <= 5
+
+
+def test_first_member_with_any_error_is_named_under_vmap():
+    """An input that is not finite, in a later member, is not reported first."""
+    q = jnp.array([[1.0, 2.0, 3.0], [1.0, 2.0, 3.0], [jnp.nan, 2.0, 3.0]])
+    v = jnp.array([[0.5, 0.0, -0.5], [0.5, 1.0, -0.5], [0.5, 0.0, -0.5]])
+
+    def started(q, v):
+        args = GOOD["args"]
+        return nhjax.initial_state(ADJUSTABLE, q, v, args=args).v
+
+    with pytest.raises((RuntimeError, ValueError), match="member 1: 1 of 2"):
+        jax.block_until_ready(jax.jit(jax.vmap(started))(q, v))
+    with pytest.raises((RuntimeError, ValueError), match="member 1: `q` is not finite"):
+        jax.block_until_ready(jax.jit(jax.vmap(started))(q[::2], v[::2]))
+
+
 def test_initial_state_with_correct_values_is_accepted(started):
     expected = start_adjustable(**GOOD)
     for got in (
