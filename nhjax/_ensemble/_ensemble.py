@@ -50,8 +50,8 @@ def ensemble(
     """Run a function for every member of an ensemble, in chunks of members.
 
     This function computes `jax.vmap(run)(members)`, even for more members than fit into
-    memory at a time. One compiled program runs all chunks and spreads the members of a
-    chunk over all devices. The last chunk is padded with members that are ignored.
+    memory at a time. The same compiled programs run all chunks, and spread the members
+    of a chunk over all devices. The last chunk is padded with members that are ignored.
 
     If `run` returns an `nhjax.Solution` or `nhjax.RESULTS`, alone or as part of a tree,
     the outcome lists the members whose runs failed, and statistics leave them out. For

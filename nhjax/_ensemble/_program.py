@@ -1,7 +1,8 @@
 """The job of an ensemble: its members, the programs that run them, and its manifest.
 
 A job is split into chunks of members. One compiled program runs every chunk, spread
-over the devices, and reports which members failed. The manifest and the text of the
+over the devices, and reports which members failed. A second program reduces the values
+of a chunk to statistics, if they are asked for. The manifest and the text of the
 program identify a job. Processes compare both before they run a job together, and a
 store contains both, so that it cannot be resumed by another job.
 """
@@ -9,6 +10,7 @@ store contains both, so that it cannot be resumed by another job.
 import hashlib
 import re
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -47,7 +49,8 @@ class Layout(NamedTuple):
 class ChunkResult(NamedTuple):
     """The result of a chunk: codes of `RESULTS`, failed steps, and its content.
 
-    The content is the values of all members, or the states of reductions.
+    The content is the values of all members, or the arrays of them that reductions use,
+    or the states of reductions.
     """
 
     codes: Int[Array, " c"]
@@ -92,15 +95,23 @@ class Job:
     def values(self, chunk: int) -> ChunkResult:
         """Start a chunk that returns the values of its members; do not wait for it."""
         inputs = self._on_devices(self._inputs(chunk))
-        return _values_of_chunk(self.run, self.members.make, inputs, self.layout)
+        return _values_of_chunk(self.run, self.members.make, inputs, self.layout, None)
 
     def states(self, chunk: int, reductions: Any) -> ChunkResult:
-        """Start a chunk that returns states of reductions; do not wait for it."""
+        """Start a chunk that returns states of reductions; do not wait for it.
+
+        The reductions are a program of their own, because it takes long to compile and
+        depends only on the shapes of the values. Runs with other methods share it.
+        """
         is_member = np.arange(self.chunk_size) < self.num_members(chunk)
         inputs, is_member = self._on_devices((self._inputs(chunk), is_member))
-        return _states_of_chunk(
-            self.run, self.members.make, reductions, inputs, is_member, self.layout
+        shapes = without_results(self.structure)
+        is_used = _is_used(reductions, shapes)
+        made = _values_of_chunk(
+            self.run, self.members.make, inputs, self.layout, is_used
         )
+        given = shapes, is_used, made.content, made.codes, is_member, self.layout
+        return made._replace(content=_reduced(reductions, *given))
 
     def _inputs(self, chunk: int) -> Any:
         return self.members.inputs(self.first_member(chunk), self.chunk_size)
@@ -273,39 +284,77 @@ def value_structure(run: Any, make: Any, inputs: Any) -> Any:
 
 
 @tracked_jit("run", "make")
-def _values_of_chunk(run: Any, make: Any, inputs: Any, layout: Layout) -> ChunkResult:
+def _values_of_chunk(
+    run: Any, make: Any, inputs: Any, layout: Layout, is_used: tuple[bool, ...] | None
+) -> ChunkResult:
+    """Run the members of a chunk.
+
+    The content is the tree of values or, if `is_used` is given, a list of the arrays
+    that the reductions use.
+    """
     value, codes, steps = _run_members(run, make, inputs, layout)
+    if is_used is not None:
+        arrays = jax.tree.leaves(without_results(value))
+        value = [x for x, used in zip(arrays, is_used, strict=True) if used]
     return ChunkResult(codes, steps, value)
 
 
-@tracked_jit("run", "make", "reductions")
-def _states_of_chunk(
-    run: Any,
-    make: Any,
-    reductions: Any,
-    inputs: Any,
-    is_member: Bool[Array, " c"],
-    layout: Layout,
-) -> ChunkResult:
-    value, codes, steps = _run_members(run, make, inputs, layout)
-    values = without_results(value)
-    counts = is_member & is_success(codes)
-    structure = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), values
+@tracked_jit("reductions")
+def _is_used(reductions: Any, shapes: Any) -> tuple[bool, ...]:
+    """Return which arrays of a value the reductions use.
+
+    Arrays that are not used need not be stored, and XLA may not even compute them.
+    """
+    values = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((1, *x.shape), x.dtype), shapes
+    )
+    counts = jax.ShapeDtypeStruct((1,), bool)
+    program = jax.make_jaxpr(partial(_updated, reductions, shapes))(
+        values, counts
+    ).jaxpr
+    operands = {x for e in program.eqns for x in map(id, e.invars)}
+    operands.update(map(id, program.outvars))
+    return tuple(id(x) in operands for x in program.invars[:-1])
+
+
+def _updated(
+    reductions: Any, shapes: Any, values: Any, counts: Bool[Array, " c"]
+) -> Any:
+    """Return the states of the reductions after the members of one chunk."""
+    return each_reduction(
+        lambda each: each.update(each.init(shapes), values, counts), reductions
     )
 
-    def reduce(values, counts):
-        return each_reduction(
-            lambda each: each.update(each.init(structure), values, counts), reductions
-        )
 
+@tracked_jit("reductions")
+def _reduced(
+    reductions: Any,
+    shapes: Any,
+    is_used: tuple[bool, ...],
+    arrays: list[Array],
+    codes: Int[Array, " c"],
+    is_member: Bool[Array, " c"],
+    layout: Layout,
+) -> Any:
+    """Return the states of the reductions for the members of a chunk.
+
+    `arrays` has the arrays of the values that the reductions use.
+    """
+    counts = is_member & is_success(codes)
+    described, treedef = jax.tree.flatten(shapes)
+    given = iter(arrays)
+    values = treedef.unflatten(
+        next(given) if used else jnp.zeros((len(codes), *x.shape), x.dtype)
+        for x, used in zip(described, is_used, strict=True)
+    )
+    reduce = partial(_updated, reductions, shapes)
     if len(layout.devices) == 1:
-        return ChunkResult(codes, steps, reduce(values, counts))
+        return reduce(values, counts)
     if layout.is_fixed:
         # Every device reduces all members, so that the order is the same as on one
         # device.
         everywhere = _on_each_device(layout, reduce, jax.P(), jax.P())
-        return ChunkResult(codes, steps, everywhere(values, counts))
+        return everywhere(values, counts)
 
     def reduce_share(values, counts):
         return jax.tree.map(lambda x: x[None], reduce(values, counts))
@@ -317,7 +366,7 @@ def _states_of_chunk(
     ]
     for other in others:
         state = each_reduction(_merge, reductions, state, other)
-    return ChunkResult(codes, steps, state)
+    return state
 
 
 @tracked_jit("reductions")
@@ -403,9 +452,12 @@ def first_failure(value: Any) -> tuple[Int[Array, ""], Int[Array, ""]]:
         for parts in (codes, steps)
     ]
     # If there is no failure, this search finds the success that is appended above.
-    bad = ~is_success(flat[0]).at[-1].set(False)
-    first = jnp.argmax(bad)
-    return flat[0][first], flat[1][first]
+    is_last = jnp.arange(flat[0].shape[0]) == flat[0].shape[0] - 1
+    first = jnp.argmax(~is_success(flat[0]) | is_last)
+    # XLA compiles a sum in less time than a lookup.
+    is_first = jnp.arange(flat[0].shape[0]) == first
+    code, step = [jnp.sum(x, where=is_first, dtype=x.dtype) for x in flat]
+    return code, step
 
 
 def results_as_codes(value: Any) -> Any:
@@ -471,12 +523,9 @@ def program_text(job: Job, reductions: Any = ()) -> str:
         return job.run(job.members.make(one))
 
     def reduce(value):
-        value, counts = without_results(value), jnp.ones(1, bool)
-        chunk = jax.tree.map(lambda x: x[None], value)
-        structure = without_results(job.structure)
-        return each_reduction(
-            lambda each: each.update(each.init(structure), chunk, counts), reductions
-        )
+        chunk = jax.tree.map(lambda x: x[None], without_results(value))
+        shapes = without_results(job.structure)
+        return _updated(reductions, shapes, chunk, jnp.ones(1, bool))
 
     one = jax.tree.map(lambda x: x[0], job.members.inputs(0, 1))
     parts = [jax.make_jaxpr(run)(one), jax.make_jaxpr(reduce)(job.structure)]

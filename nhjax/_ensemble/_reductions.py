@@ -7,6 +7,7 @@ most the last bit of the result.
 """
 
 import math
+import operator
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
@@ -86,10 +87,8 @@ class Mean(AbstractReduction):
         self, state: Any, values: PyTree[Array], counts: Bool[Array, " c"]
     ) -> Any:
         """Add the members of a chunk."""
-        return self.merge(state, fold(self.merge, self._lift, values, counts))
-
-    def _lift(self, value: Any, counts: Bool[Array, ""]) -> "_Sums":
-        return _Sums(counts.astype(int), _lifted(_select(self.of, value), counts))
+        found = _select_each(self.of, values)
+        return _fold_vectors(self.merge, _sums_of_one, state, found, counts)
 
     def merge(self, one: Any, other: Any) -> Any:
         """Combine the sums of two sets of members."""
@@ -146,12 +145,8 @@ class Variance(AbstractReduction):
         self, state: Any, values: PyTree[Array], counts: Bool[Array, " c"]
     ) -> Any:
         """Add the members of a chunk."""
-        return self.merge(state, fold(self.merge, self._lift, values, counts))
-
-    def _lift(self, value: Any, counts: Bool[Array, ""]) -> "_Moments":
-        mean = _lifted(_select(self.of, value), counts)
-        zeros = jax.tree.map(jnp.zeros_like, mean)
-        return _Moments(counts.astype(int), mean, zeros)
+        found = _select_each(self.of, values)
+        return _fold_vectors(self.merge, _moments_of_one, state, found, counts)
 
     def merge(self, one: Any, other: Any) -> Any:
         """Combine the moments of two sets of members."""
@@ -467,10 +462,11 @@ def _interpolated_quantile(
 def fold(
     merge: Callable[[Any, Any], Any],
     lift: Callable[[Any, Any], Any],
+    state: PyTree[Array],
     values: PyTree[Array],
     counts: Bool[Array, " c"],
 ) -> PyTree[Array]:
-    """Merge the states of the c members of a chunk, in an order that depends only on c.
+    """Add the c members of a chunk to a state, in an order that depends only on c.
 
     About √c states each collect about √c members. All these states are updated at the
     same time, as vectors, and are merged at the end. This needs only about 2√c
@@ -478,8 +474,11 @@ def fold(
 
     **Arguments:**
 
+    - `merge`: merges two states.
     - `lift`: creates the state of one member from its value and from a boolean, which
         is False for a member that does not count.
+    - `state`: the state of the members before this chunk.
+    - `values`, `counts`: as for `AbstractReduction.update`.
     """
     size = counts.shape[0]
     columns = max(1, math.isqrt(size))
@@ -489,24 +488,65 @@ def fold(
         widths = [(0, rows * columns - size)] + [(0, 0)] * (x.ndim - 1)
         return jnp.pad(x, widths).reshape(rows, columns, *x.shape[1:])
 
-    def first_and_rest(tree):
-        return [
-            jax.tree.map(lambda x, part=part: x[part], tree)
-            for part in (0, slice(1, None))
-        ]
-
     def add_row(states, row):
         return jax.vmap(merge)(states, jax.vmap(lift)(*row)), None
 
-    first, rest = first_and_rest(jax.tree.map(arranged, (values, counts)))
+    members = jax.tree.map(arranged, (values, counts))
+    first, rest = [
+        jax.tree.map(lambda x, part=part: x[part], members)
+        for part in (0, slice(1, None))
+    ]
     states, _ = jax.lax.scan(add_row, jax.vmap(lift)(*first), rest)
-    start, others = first_and_rest(states)
-    state, _ = jax.lax.scan(lambda a, b: (merge(a, b), None), start, others)
-    return state
+    return jax.lax.scan(lambda a, b: (merge(a, b), None), state, states)[0]
 
 
-def _select(of: Callable[[Any], Any] | None, value: Any) -> Any:
-    return value if of is None else of(value)
+def _fold_vectors(
+    merge: Callable[[Any, Any], Any],
+    lift: Callable[[Any, Any], Any],
+    state: Any,
+    values: PyTree[Array],
+    counts: Bool[Array, " c"],
+) -> Any:
+    """Add the members of a chunk to a state, with all numbers of a dtype as one vector.
+
+    XLA compiles an expression for each array, and sums of double-double numbers are
+    long expressions.
+    """
+    values = jax.tree.map(lambda x: x.astype(_sum_dtype(x)), values)
+    number, *trees = state
+    start = type(state)(number, *map(_double_vectors, trees))
+    vectors = _vectors(values, 1)
+    number, *found = fold(merge, lift, start, vectors, counts)
+    pairs = zip(found, trees, strict=True)
+    return type(state)(number, *[_as_doubles(x, tree) for x, tree in pairs])
+
+
+def _vectors(tree: PyTree[Array], axis: int) -> list[Array]:
+    """Join the arrays of each dtype, with the axes from `axis` on as one axis."""
+    groups: dict[Any, list[Array]] = {}
+    for x in jax.tree.leaves(tree):
+        groups.setdefault(x.dtype, []).append(x.reshape(*x.shape[:axis], -1))
+    return [jnp.concatenate(group, axis) for group in groups.values()]
+
+
+def _double_vectors(tree: Any) -> list["DoubleDouble"]:
+    parts = [_vectors(_map(operator.itemgetter(i), tree), 0) for i in (0, 1)]
+    return [DoubleDouble(*pair) for pair in zip(*parts, strict=True)]
+
+
+def _as_doubles(vectors: list["DoubleDouble"], tree: Any) -> Any:
+    """Return the numbers in vectors that `_double_vectors` has made from this tree."""
+    place = {x.high.dtype: (x, 0) for x in vectors}
+
+    def part(like: DoubleDouble) -> DoubleDouble:
+        shape, dtype = like.high.shape, like.high.dtype
+        vector, start = place[dtype]
+        place[dtype] = vector, start + like.high.size
+        return DoubleDouble(
+            *[x[start : start + like.high.size].reshape(shape) for x in vector]
+        )
+
+    return _map(part, tree)
 
 
 def _select_each(of: Callable[[Any], Any] | None, values: Any) -> Any:
@@ -584,6 +624,15 @@ class _Moments(NamedTuple):
     squares: Any
 
 
+def _sums_of_one(value: Any, counts: Bool[Array, ""]) -> _Sums:
+    return _Sums(counts.astype(int), _lifted(value, counts))
+
+
+def _moments_of_one(value: Any, counts: Bool[Array, ""]) -> _Moments:
+    mean = _lifted(value, counts)
+    return _Moments(counts.astype(int), mean, jax.tree.map(jnp.zeros_like, mean))
+
+
 def _map(function: Callable[..., Any], *trees: Any) -> Any:
     """Map over the `DoubleDouble` nodes of trees."""
     return jax.tree.map(function, *trees, is_leaf=lambda x: isinstance(x, DoubleDouble))
@@ -597,12 +646,9 @@ def _zeros(value: Any) -> Any:
 
 def _lifted(value: Any, counts: Bool[Array, ""]) -> Any:
     """Convert the value of a member, or return zeros if it does not count."""
-
-    def leaf(x):
-        x = x.astype(_sum_dtype(x))
-        return double_double(jnp.where(counts, x, jnp.asarray(0, x.dtype)))
-
-    return jax.tree.map(leaf, value)
+    return jax.tree.map(
+        lambda x: double_double(jnp.where(counts, x, jnp.asarray(0, x.dtype))), value
+    )
 
 
 def _sum_dtype(x: Any) -> Any:

@@ -218,6 +218,10 @@ class MemorySink(AbstractSink):
                 content[place] = np.frombuffer(data, np.uint8)
 
 
+def _dtypes(state: Any) -> list[Any]:
+    return [x.dtype for x in jax.tree.leaves(state)]
+
+
 class ReductionSink(AbstractSink):
     """Stores states of reductions, whose size does not depend on the ensemble's size.
 
@@ -318,7 +322,10 @@ class ReductionSink(AbstractSink):
 
     def _merge(self, state: Any, failures: FailureList) -> None:
         state = self._placed(state)
-        self.state = merged_states(self.reductions, self.state, state)
+        # Merging the first state would only change its dtypes, but compile a program.
+        if self.state is not self.neutral or _dtypes(state) != _dtypes(self.neutral):
+            state = merged_states(self.reductions, self.state, state)
+        self.state = state
         self.failures.add(failures.rows)
 
     def _placed(self, state: Any) -> Any:

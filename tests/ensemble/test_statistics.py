@@ -2,6 +2,7 @@
 
 from fractions import Fraction
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -109,6 +110,48 @@ def test_ensemble_statistics_of_integers_and_booleans_are_computed():
     assert [x.item() for x in got["least"]] == [0, False]
 
 
+def test_ensemble_moments_of_arrays_of_several_dtypes_and_shapes_equal_numpy(data):
+    small = data["small"]
+    values = {
+        "matrix": small[:, :, None] * np.array([1.0, -2.0, 1e6]),
+        "single": small.astype(np.float32)[:, 0],
+        "double": small[:, 1] + 1e6,
+        "whole": np.arange(MEMBERS) ** 2,
+        "nothing": np.zeros((MEMBERS, 0)),
+    }
+    reduce = {"mean": nhjax.Mean(), "variance": nhjax.Variance(ddof=0)}
+    run = {"reduce": reduce, "chunk_size": 300}
+    got = nhjax.ensemble(lambda member: member, values, **run).statistics
+    for name, x in values.items():
+        mean, variance = got["mean"][name], got["variance"][name]
+        assert mean.shape == variance.shape == x.shape[1:]
+        assert (
+            mean.dtype
+            == variance.dtype
+            == (np.float32 if name == "single" else np.float64)
+        )
+        x, rtol = x.astype(float), 1e-6 if name == "single" else 1e-13
+        np.testing.assert_allclose(mean, np.mean(x, axis=0), rtol=rtol)
+        np.testing.assert_allclose(variance, np.var(x, axis=0), rtol=rtol)
+
+
+def test_ensembles_with_equal_values_and_reductions_trace_the_reductions_once():
+    """Compiling reductions takes as long as compiling a short run."""
+    traced = []
+
+    def of(value):
+        traced.append(value)
+        return value
+
+    reduce, x, counts = nhjax.Mean(of=of), np.linspace(0.0, 1.0, 6), []
+    for run in (jnp.sin, jnp.cos, jnp.tan):
+        got = nhjax.ensemble(run, x, reduce=reduce, chunk_size=3).statistics
+        np.testing.assert_allclose(got, np.mean(run(x)), rtol=1e-14)
+        counts.append(len(traced))
+    # Each ensemble creates the state without members.
+    assert counts[2] - counts[1] == counts[1] - counts[0] < counts[0]
+
+
 class Product(nhjax.AbstractReduction):
     """A reduction that a user has defined."""
 
@@ -145,3 +188,48 @@ def test_ensemble_variance_of_one_member_raises():
 def test_ensemble_histogram_with_invalid_edges_raises(edges):
     with pytest.raises(ValueError, match="`edges` must"):
         nhjax.Histogram(edges)
+
+
+class Count(Product):
+    """Counts members; a chunk returns a number of a smaller type than the total."""
+
+    def init(self, value):
+        """Count no member."""
+        return jnp.zeros((), jnp.int64)
+
+    def update(self, state, values, counts):
+        """Count the members of a chunk in one byte."""
+        return jnp.sum(counts, dtype=jnp.int8)
+
+    def merge(self, one, other):
+        """Add two counts."""
+        return one + other
+
+
+def test_ensemble_reduction_whose_chunks_have_another_dtype_keeps_the_larger_dtype():
+    run = {"reduce": Count(), "chunk_size": 100}
+    with jax.numpy_dtype_promotion("standard"):
+        found = nhjax.ensemble(lambda x: x, jnp.arange(200.0), **run).statistics
+    assert found == 200.0
+
+
+def test_ensemble_with_reductions_does_not_store_values_that_they_do_not_use():
+    members, size, chunk = 40, 100_000, 20
+
+    def run(x):
+        return {"large": jnp.sin(x * jnp.arange(float(size))), "small": 2.0 * x}
+
+    x = np.arange(float(members))
+    reduce = {"small": nhjax.Mean(of=lambda value: value["small"])}
+    sizes = []
+
+    class Meter(nhjax.TextProgressMeter):
+        def update(self, done, total):
+            sizes.append(sum(x.nbytes for x in jax.live_arrays()))
+
+    before = sum(x.nbytes for x in jax.live_arrays())
+    options = {"chunk_size": chunk, "progress_meter": Meter()}
+    found = nhjax.ensemble(run, x, reduce=reduce, **options)
+    assert float(found.statistics["small"]) == 2.0 * np.mean(x)
+    assert sizes
+    assert max(sizes) - before < 8 * size
