@@ -149,16 +149,16 @@ def run(
     places = record_places(keeps_all, sampled, most)
     saving = Saving.of(saveat, fn, most, places, stepper.log_length)
     loop = Loop(stepper, saving, solver_options.meter)
-    start, carry, rows = _all_steps(adjoint, loop, y0, saveat.checkpoint)
+    first, carry, rows = _all_steps(adjoint, loop, y0, saveat, t0)
     given = (system, y0, t0, grid, args), options.events, options.controller
     end = loop.stepper.finish(carry, (rows.saved, rows.record), rows.log, given)
     # The number of filled rows includes a row for an event that ends the run.
     zero = jnp.zeros((), jnp.int32)
     number = loop.stepper.num_filled(carry, zero) if is_variable else None
     if number is None:
-        ts, ys = _output(saveat, loop, t0, start, end, sampled)
+        ts, ys = _output(saveat, loop, first, end, sampled)
     else:
-        ts, ys = _padded_output(saveat, loop, t0, start, end, number)
+        ts, ys = _padded_output(saveat, loop, t0, first, end, number)
     interpolation, checkpoint, records = None, None, end.rows[1]
     if saveat.dense and records is not None:
         interpolation = _interpolation(plain, grid, records, number)
@@ -589,24 +589,41 @@ def _sampled_steps(saveat: SaveAt, grid: TimeGrid) -> Int[Array, " k"] | None:
 
 
 def _all_steps(
-    adjoint: AbstractAdjoint, loop: Loop, y0: State | Checkpoint, checkpoint: bool
-) -> tuple[State, AbstractCarry, Rows]:
-    """Take all steps; return the first state, the last carry and the saved rows."""
+    adjoint: AbstractAdjoint,
+    loop: Loop,
+    y0: State | Checkpoint,
+    saveat: SaveAt,
+    t0: FloatScalar,
+) -> tuple[PyTree[Array] | None, AbstractCarry, Rows]:
+    """Take all steps; return the saved start, the last carry and the saved rows."""
+    # If the steps call the function `fn` of `SaveAt`, their kernel also calls it for
+    # the start. Otherwise `fn` is called outside, and the engine that compiles the
+    # steps does not depend on `fn`.
+    is_inside = bool(saveat.steps)
 
-    def steps(loop: Loop, first: AbstractCarry | None, *given: Any):
+    def saved(loop: Loop, t0: FloatScalar, y: State) -> PyTree[Array] | None:
+        return loop.saving.saved(t0, y, loop.stepper.plain.args) if saveat.t0 else None
+
+    def steps(
+        loop: Loop, t0: FloatScalar, first: AbstractCarry | None, *given: Any
+    ) -> tuple[Any, AbstractCarry, Rows]:
         first = _start(loop.stepper, *given) if first is None else first
-        return first.step_state.state, *adjoint.run(loop, loop.moving(first))
+        y = first.step_state.state
+        start = saved(loop, t0, y) if is_inside else y
+        return start, *adjoint.run(loop, loop.moving(first))
 
-    if isinstance(y0, State) and not checkpoint:
-        return as_cpu_kernel(steps, loop, None, y0)
-    # If the compiler knows values with which a loop starts, such as zeros in matrices,
-    # it generates other instructions for the loop, which round differently. The barrier
-    # hides the start values, so that this run and a run resumed from its checkpoint
-    # take their steps by the same instructions.
-    first = as_cpu_kernel(_start, loop.stepper, y0)
-    given, rest = eqx.partition((loop, first), eqx.is_array)
-    loop, first = eqx.combine(jax.lax.optimization_barrier(given), rest)
-    return as_cpu_kernel(steps, loop, first)
+    if isinstance(y0, State) and not saveat.checkpoint:
+        start, carry, rows = as_cpu_kernel(steps, loop, t0, None, y0)
+    else:
+        # If the compiler knows values with which a loop starts, such as zeros in
+        # matrices, it generates other instructions for the loop, which round
+        # differently. The barrier hides the start values, so that this run and a run
+        # resumed from its checkpoint take their steps by the same instructions.
+        first = as_cpu_kernel(_start, loop.stepper, y0)
+        given, rest = eqx.partition((loop, first), eqx.is_array)
+        loop, first = eqx.combine(jax.lax.optimization_barrier(given), rest)
+        start, carry, rows = as_cpu_kernel(steps, loop, t0, first)
+    return start if is_inside else saved(loop, t0, start), carry, rows
 
 
 def _start(stepper: AbstractStepper[Any, Any], y0: State | Checkpoint) -> AbstractCarry:
@@ -634,17 +651,19 @@ def _noise(stepper: AbstractStepper[Any, Any], y0: State | Checkpoint) -> Functi
 def _output(
     saveat: SaveAt,
     loop: Loop,
-    t0: FloatScalar,
-    start: State,
+    first: PyTree[Array] | None,
     end: RunEnd[Any, Any],
     sampled: Int[Array, " k"] | None,
 ) -> tuple[PyTree[Array], PyTree[Array]]:
-    """Join the output of the start, the steps and the end: times and values."""
+    """Join the output of the start, the steps and the end: times and values.
+
+    `first` is the saved start, or None if the start is not saved.
+    """
     saving, args, ts = loop.saving, loop.stepper.plain.args, saveat.ts
     saved, records = end.rows
     pieces = []
     if saveat.t0:
-        pieces.append(_one(saving.saved(t0, start, args)))
+        pieces.append(_one(first))
     if saveat.steps:
         pieces.append(jax.tree.map(lambda x: x[:-1], saved))
     if ts is not None and sampled is not None and saving.record_slots is not None:
@@ -660,7 +679,7 @@ def _padded_output(
     saveat: SaveAt,
     loop: Loop,
     t0: FloatScalar,
-    start: State,
+    first: PyTree[Array] | None,
     end: RunEnd[Any, Any],
     number: Int[Array, ""],
 ) -> tuple[PyTree[Array], PyTree[Array]]:
@@ -673,7 +692,7 @@ def _padded_output(
     saved, records = end.rows
     pieces = []
     if saveat.t0:
-        pieces.append(_one(saving.saved(t0, start, args)))
+        pieces.append(_one(first))
     last = _one(saving.saved(end.t, end.state, args)) if saveat.t1 else None
     if saveat.steps:
         # The extra row of the buffers receives the output at the end of the run.

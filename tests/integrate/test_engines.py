@@ -145,3 +145,24 @@ def test_ensemble_of_any_size_equals_its_members(members):
     # All lanes of a vector compute alike, so the place of a member does not matter.
     np.testing.assert_array_equal(q[::-1], run(dt[::-1]))
     np.testing.assert_array_equal(q[:1], run(dt[:1]))
+
+
+def test_engine_of_steps_does_not_depend_on_the_function_of_the_saved_ends():
+    """The native engine has no Fourier transforms."""
+
+    def spectrum(t, y, args):
+        return jnp.abs(jnp.fft.fft(y.q))
+
+    def run(y0, **saved):
+        saveat = nhjax.SaveAt(fn=spectrum, **saved)
+        options = {"dt": 0.1, "num_steps": 10, "saveat": saveat}
+        return nhjax.integrate(PARTICLE.system, LobattoIIIAB(2), y0, **options).ys
+
+    y0 = PARTICLE.initial_state()
+    for saved in ({"t1": True}, {"t0": True, "t1": True}):
+        uses = nhjax.engines(lambda y0, saved=saved: run(y0, **saved), y0)
+        assert {use.engine for use in uses} == {"lanes"}
+    uses = nhjax.engines(lambda y0: run(y0, t0=True, steps=True), y0)
+    assert "xla" in {use.engine for use in uses}
+    both = jax.jit(lambda y0: run(y0, t0=True, t1=True))(y0)
+    np.testing.assert_allclose(both[0], spectrum(0.0, y0, None), rtol=1e-14)
