@@ -29,14 +29,14 @@ QUICK: Mapping[str, Mapping[str, Any]] = MappingProxyType(
 # each pair (s, h). Otherwise it compiles one program for each s.
 _COSTS: Mapping[str, tuple[float, float, bool]] = MappingProxyType(
     {
-        "particle-order": (4.0, 1e-5, False),
-        "cvt-energy": (4.0, 2e-5, True),
-        "chaotic-energy": (3.5, 4e-6, True),
-        "unicycle-order": (6.5, 2e-5, False),
-        "ball-invariants": (12.0, 1e-4, False),
+        "particle-order": (2.4, 1e-5, False),
+        "cvt-energy": (2.2, 2e-5, True),
+        "chaotic-energy": (1.6, 4e-6, True),
+        "unicycle-order": (4.5, 2e-5, False),
+        "ball-invariants": (6.0, 1e-4, False),
     }
 )
-_START_SECONDS = 4.0
+_START_SECONDS = 3.0
 
 
 class ArgumentError(ValueError):
