@@ -707,7 +707,7 @@ def _textbook_systems() -> list[Picture]:
             _knife_edge,
             "position [m]",
             "the edge does not slide down the slope, but drifts across the slope at "
-            "the mean speed G/2θ̇",
+            "the mean speed G/(2θ̇)",
             lambda run_, k: [line[:, ::-1] for line in _headed(0.3)(run_, k)],
             21,
             axes=("y, across the slope [m]", "x, downhill [m]"),

@@ -1,4 +1,4 @@
-"""An operation that tells the compiler the initial carry of a loop that is continued.
+"""An operation that tells the compiler with which carry an interrupted loop began.
 
 A run is a loop, and some numbers in its initial carry are constants, such as the zeros
 of a mass matrix. If no iteration changes such a number, it is a constant of the whole

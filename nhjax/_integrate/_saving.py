@@ -358,7 +358,8 @@ class Saving(eqx.Module):
     def _record_slot(self, k: Int[Array, ""]) -> Int[Array, ""]:
         if self.record_slots is not None:
             return self.record_slots[jnp.minimum(k, self.num_steps)]
-        # A chunk of a run has no slots: it keeps the records of all its steps.
+        # A chunk of a run has no `record_slots`, because it keeps the record of each of
+        # its steps.
         slot = k - cast(Array, self.first_step)
         return jnp.where(k < self.num_steps, slot, self.num_records)
 

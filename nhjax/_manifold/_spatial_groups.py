@@ -230,8 +230,8 @@ class SO3(AbstractMotionGroup):
         The result has norm 1 up to rounding.
         """
         total, error = two_sum(q, multiply(q, self._increment(xi)) + compensation)
-        # A Newton step for the norm is applied to the sum and its error together. The
-        # Newton step removes the rounding error of the norm from the previous step, and
+        # A Newton step for the norm is applied to the sum and its error together. It
+        # removes the rounding error that the previous time step left in the norm, and
         # does not change the rotation.
         correction = 0.5 * (1 - dot(total, total)) - dot(total, error)
         return total, error + correction * total

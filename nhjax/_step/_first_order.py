@@ -169,7 +169,7 @@ class FirstOrderTerms(eqx.Module):
     ) -> Float[Array, "r n *c"]:
         """Compute the changes of node velocities that are due to positions.
 
-        `change` is the change of the stage velocities.
+        `change` is the change of the stage velocities, which changes the positions.
         """
         return -_times(self.node_momentum, _weighted(stages.node_weights, change))
 

@@ -329,7 +329,8 @@ class Builder:
         self.graph = Graph()
         self.memory = Memory(self.graph)
         self.operations, self.unroll = operations, unroll
-        # The enclosing equations, which identify the current equation.
+        # The place of the current equation: the ids of the enclosing equations, the
+        # side of each enclosing branch and the index of each unrolled iteration.
         self.path: list[int] = []
         # For the path of each loop, the positions of carried numbers that change.
         self.changing: dict[tuple[int, ...], set[int]] = {}

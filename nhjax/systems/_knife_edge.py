@@ -23,7 +23,7 @@ class KnifeEdge(AbstractConstrainedExample):
     L = m/2 (ẋ² + ẏ²) + I/2 θ̇² + mGx,  Φ = -sin θ ẋ + cos θ ẏ,  q = (x, y, θ).
 
     The heading turns uniformly. The edge does not slide down the slope, but drifts
-    across the slope at the mean speed G/2θ̇.
+    across the slope at the mean speed G/(2θ̇).
 
     **Parameters:** `mass` m [kg], `inertia` I about the contact [kg m²], `gravity`
     G, the component of gravity along the slope [m/s²].

@@ -24,13 +24,13 @@ from ._sleigh import ChaplyginSleigh
 class RodSleigh(AbstractNonholonomicExample):
     """Two point masses on a rigid rod, with a blade under the first one, on R⁴.
 
-    L = m₁/2 |ṙ₁|² + m₂/2 |ṙ₂|²,  q = (x₁, y₁, x₂, y₂),
+    L = m₁/2 |ṙ₁|² + m₂/2 |ṙ₂|²,  q = (x₁, y₁, x₂, y₂).
 
-    with the nonholonomic constraint Φ = n·ṙ₁ and the holonomic constraint
-    Φ_hol = |r₂ - r₁|² - l².
-    The blade makes the angle β with the rod; its normal n is (r₂ - r₁)/l turned by
-    β + π/2. For β = 0 the system is the `ChaplyginSleigh`. For other angles n is not
-    orthogonal to the rod, so that the reactions of the two constraints are coupled.
+    The nonholonomic constraint is Φ = n·ṙ₁, and the holonomic constraint is
+    Φ_hol = |r₂ - r₁|² - l². The blade makes the angle β with the rod; its normal n is
+    (r₂ - r₁)/l turned by β + π/2. For β = 0 the system is the `ChaplyginSleigh`. For
+    other angles n is not orthogonal to the rod, so that the reactions of the two
+    constraints are coupled.
 
     If the blade is shifted along n, the body can still have the same velocities.
     Therefore the body moves like a `ChaplyginSleigh` whose blade is at the foot of the

@@ -142,11 +142,12 @@ class TurntableBall(AbstractConstrainedGroupExample):
     def invariants(
         self, t: FloatScalarLike, q: tuple[Array, Array], v: Array
     ) -> dict[str, Array]:
-        """Compute the moving energy and the momentum about the contact, in space.
+        """Compute the moving energy and, if `frame="space"`, the contact momentum.
 
-        For a homogeneous ball, the horizontal components of this momentum are r(1 + a)
-        times the second and the third value of `first_integrals`, and the vertical
-        component is r²a times the first value.
+        The contact momentum is the angular momentum about the contact, along the axes
+        of space. For a homogeneous ball, its horizontal components are r(1 + a) times
+        the second and the third value of `first_integrals`, and its vertical component
+        is r²a times the first value.
         """
         x, y = q[1]
         energy = self.energy(t, q, v)

@@ -12,8 +12,8 @@ from .._solution import EventLog
 class LogEntry(eqx.Module):
     """The entry of one event in the log, or of all events along a leading axis.
 
-    To undo the step to an event, a reverse replay starts from the state `before`. It
-    also needs the following fields.
+    To undo the step to an event, a reverse replay starts from `before`, the state at
+    the event before the reset. It also needs the following fields.
 
     - `iteration`: the index of the iteration of the time loop that ended at the event.
     - `node`, `offset`: the iteration started at t_k + offset, where k = `node`.
