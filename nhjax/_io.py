@@ -29,8 +29,8 @@ from ._results import result_codes, RESULTS
 from ._system import State
 
 
-# The version of the file format. Increase it if files change so that earlier releases
-# cannot read them.
+# The version of the file format. Increase it after a change that makes new files
+# unreadable for earlier releases.
 _VERSION = 1
 _HEADER = "nhjax"
 
@@ -114,7 +114,7 @@ def save(path: str | os.PathLike[str], tree: Any) -> None:
     entries: dict[str, Any] = {_HEADER: np.frombuffer(text, np.uint8), **arrays}
     unfinished = path.with_name(f".{uuid.uuid4().hex}")
     try:
-        # `tempfile` is not used, because only the owner may read its files.
+        # `tempfile` is not used: it creates files that only the owner may read.
         with open(unfinished, "xb") as file:
             np.savez(file, **entries)
             file.flush()
@@ -204,7 +204,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Read all entries; the checksums of the .npz file detect damaged entries."""
     # Open the file here: NumPy does not close a damaged file that it has opened itself.
     with open(path, "rb") as opened:
-        # For files of other formats, NumPy would recommend to load pickled objects.
+        # For files of other formats, NumPy would recommend loading pickled objects.
         if not zipfile.is_zipfile(opened):
             raise ValueError("it is not an .npz")
         opened.seek(0)
@@ -337,7 +337,7 @@ def _to_jax(name: str, array: np.ndarray) -> Array:
 
 
 def _rebuild_results(codes: Array, names: dict[str, int]) -> PyTree[Array]:
-    """Build results from names, because other releases may use other codes."""
+    """Find result codes by their names: other releases may use other codes."""
     unknown = sorted(set(names) - set(result_codes()))
     if unknown:
         raise ValueError(

@@ -68,8 +68,8 @@ def momentum_map(
 ) -> Float[Array, "..."]:
     """Compute the momentum p · ξ_Q(q) along an infinitesimal symmetry ξ_Q.
 
-    The momentum is conserved if ξ_Q is a symmetry of the Lagrangian and a virtual
-    displacement that the constraints permit, D2Φ · ξ_Q = 0. Otherwise the momentum
+    The momentum is conserved if ξ_Q is a symmetry of the Lagrangian and the constraints
+    permit the virtual displacement ξ_Q, that is, D2Φ · ξ_Q = 0. Otherwise the momentum
     satisfies the nonholonomic momentum equation.
 
     **Arguments:**

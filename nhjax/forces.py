@@ -382,8 +382,8 @@ class Spring(_AbstractPulledBack):
     points stay apart.
 
     `system.energy` does not include the energy of a `Spring`. To include it, add
-    -½ k (|d| - l)² to the Lagrangian instead of using a `Spring`; this is possible only
-    without a damper. The computed steps are the same.
+    -½ k (|d| - l)² to the Lagrangian instead of using a `Spring`. The computed steps
+    are the same. This is possible only without a damper.
 
     **Arguments:**
 
@@ -448,8 +448,8 @@ class Drag(_AbstractPulledBack):
     c₂ = ½ ρ C A with the drag coefficient C. If the point is an angle, f is a torque,
     such as the viscous friction of a bearing.
 
-    The quadratic part has a kink at u = 0. If a point that moves along a line turns
-    back in a step, that step has only order 2.
+    The quadratic part has a kink at u = 0. If a point on a line reverses its motion
+    during a step, this step has only order 2.
 
     **Arguments:**
 
@@ -496,8 +496,8 @@ class Drag(_AbstractPulledBack):
 class Motor(_AbstractPulledBack):
     """A geared motor whose torque falls linearly with its speed.
 
-    The torque on the angle φ is i τ₀ (c - i φ̇ / ω₀). This is a DC motor with the
-    fraction c of its full voltage, which drives the angle through a gear of ratio i.
+    The torque on the angle φ is i τ₀ (c - i φ̇ / ω₀). This describes a DC motor that
+    runs at the fraction c of its full voltage and drives φ through a gear of ratio i.
     Add the inertia J of its rotor to the Lagrangian, as ½ J (i φ̇)².
 
     **Arguments:**

@@ -2,8 +2,8 @@
 
 The load of a contact is a reaction, so that these forces depend on the multipliers. All
 laws are smooth: at speeds far below a parameter u₀, the friction is proportional to the
-velocity. A contact that should rest on an incline therefore creeps: if it needs the
-fraction r < 1 of the largest friction, its speed is u₀ artanh(r). Near rest, the
+velocity. A contact that should rest on an incline therefore creeps. If holding it takes
+the fraction r < 1 of the largest friction, its speed is u₀ artanh(r). Near rest, the
 iteration of a step converges fast for steps up to about u₀ · mass / friction.
 """
 
@@ -359,8 +359,8 @@ class RollingResistance(_AbstractOnContact):
 
     The torque is -|N| e tanh(|ω| / ω₀) in the direction of ω, the component of the
     body's angular velocity parallel to the plane. This law does not describe the
-    friction of a contact that runs along the rim of a spinning coin: write your own
-    force for it.
+    friction of a spinning coin, whose contact runs along the rim: write your own force
+    for it.
 
     **Arguments:**
 

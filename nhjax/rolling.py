@@ -101,7 +101,7 @@ class Touch(NamedTuple):
     """The place where a body is nearest to the ground.
 
     - `point`: the point c of the body.
-    - `normal`: the unit normal of the ground there, which points away from it.
+    - `normal`: the unit normal there, which points away from the ground.
     - `height`: the distance from the ground to the point, negative below the ground.
     """
 
@@ -187,8 +187,8 @@ class Surface(AbstractGround):
 
     The body touches where its surface and the ground have opposite normals. This point
     is found by Newton's method in each evaluation, and differentiated by the implicit
-    function theorem. There must be only one such point near the body: in a hollow, the
-    body must be more curved than the ground.
+    function theorem. Only one such point may exist near the body: in a hollow, the body
+    must be more curved than the ground.
 
     **Arguments:**
 
@@ -292,10 +292,10 @@ class Heightfield(eqx.Module):
             )
         import scipy.ndimage
 
-        # Mirroring at the border causes an error of the spline, which is smaller by a
-        # factor of 0.268 in each further row. With 32 extra rows it is below round-off
-        # in the grid. Two rows outside of the grid are
-        # kept, which are enough to evaluate the spline at the border of the grid.
+        # Mirroring at the border causes an error of the spline, which decreases by a
+        # factor of 0.268 from row to row. With 32 extra rows, the error inside the grid
+        # is below round-off. Two rows outside of the grid are kept, because the spline
+        # needs them at the border.
         padded = np.pad(given, 32, mode="reflect", reflect_type="odd")
         spline = scipy.ndimage.spline_filter(padded, order=3, mode="mirror")
         self.coefficients = spline[30:-30, 30:-30]
@@ -308,8 +308,8 @@ class Heightfield(eqx.Module):
         last = jnp.asarray(np.asarray(self.coefficients.shape) - 6, x.dtype)
         cell = jnp.clip(jnp.floor(jax.lax.stop_gradient(place)), 0 * last, last)
         weights = jax.vmap(_spline_weights)(place - cell)
-        # Row i of the grid has the coefficient with the index i + 2, and the four
-        # coefficients of a cell begin one row before it.
+        # The coefficient of row i of the grid has the index i + 2, and the four
+        # coefficients of a cell begin one row before the cell.
         first = cell.astype(jnp.int32) + 1
         coefficients = jnp.asarray(self.coefficients, x.dtype)
         near = jax.lax.dynamic_slice(coefficients, first, (4, 4))
@@ -520,10 +520,9 @@ class Wheel(AbstractContact):
     The direction `along` = axle x n, normalised, is the rolling direction, and `across`
     = n x `along`.
 
-    The axle must not be perpendicular to the ground, because then no single point of
-    the rim is the lowest. A track that runs over a sprocket can be modelled as a wheel
-    that has the radius of the sprocket and touches the ground under the middle of the
-    track.
+    The axle must not be perpendicular to the ground: the whole rim would then be at the
+    same height. A track that runs over a sprocket can be modelled as a wheel that has
+    the radius of the sprocket and touches the ground under the middle of the track.
 
     **Arguments:**
 
@@ -600,7 +599,7 @@ class Wheel(AbstractContact):
 
 
 class Ellipsoid(AbstractContact):
-    """An ellipsoid or a ball that rolls, and may spin about the normal.
+    """An ellipsoid or a ball that rolls, and can also spin about the normal.
 
     The directions `along` and `across` do not turn with the body; for a horizontal
     plane with the normal (0, 0, 1) they are x and y.
@@ -714,10 +713,10 @@ class Blade(AbstractContact):
 class Contacts(eqx.Module):
     """The contacts of a machine, as the constraints of a system.
 
-    Pass its `nonholonomic` and its `holonomic` to `LagrangianSystem`; each is None if
-    there are no such constraints. The multipliers of the directions without slip come
-    first, then the multipliers of the heights, both in the order of the contacts.
-    `multiplier_names` lists them.
+    Pass its attributes `nonholonomic` and `holonomic` to `LagrangianSystem`; each is
+    None if there are no such constraints. The multipliers of the directions without
+    slip come first, then the multipliers of the heights, both in the order of the
+    contacts. `multiplier_names` lists them.
 
     **Arguments:**
 
@@ -793,9 +792,9 @@ class Contacts(eqx.Module):
     ) -> dict[str, Float[Array, "3"]]:
         """Compute the force of the ground on each body at its contact [N].
 
-        The forces follow from the multipliers of the state. They have no parts in
-        directions that are not constrained. For a contact with `touches=False`, they
-        have no part along the normal, because no multiplier represents this force.
+        The forces follow from the multipliers of the state. They are zero in directions
+        that are not constrained. For a contact with `touches=False`, the normal force
+        is not known and is returned as zero, because it has no multiplier.
 
         **Arguments:**
 
@@ -803,7 +802,7 @@ class Contacts(eqx.Module):
             system must have the constraints of these contacts, and no additional ones
             except those that `followed_by` describes.
         - `frame`: whether the force is a vector in space, or has the components along,
-            across and normal of the frame of the contact.
+            across and normal in the frame of the contact.
 
         **Returns:** vectors of shape (3,), by the names of the contacts.
 
@@ -867,7 +866,7 @@ class Contacts(eqx.Module):
         return multipliers[count + sum(before)]
 
     def check_load(self, name: str, load: Any) -> None:
-        """Raise a `ValueError` unless there is a load, or a multiplier for it."""
+        """Raise a `ValueError` unless a load is given or a multiplier represents it."""
         if not self[name].touches and load is None:
             raise ValueError(
                 f"The normal force on {name!r} is not a multiplier, since its height "
@@ -980,8 +979,8 @@ def margin(
 
     It is the function (t, y, args) -> μ |N| - |F_t| [N], with the friction coefficient
     μ, the normal force N and the force F_t of the constraints along the ground. The
-    contact rolls where its value is positive. Pass the function to `SaveAt(fn=)`. To
-    stop a run where the value becomes zero, use `slips`.
+    contact rolls while the value is positive. Pass the function to `SaveAt(fn=)`. To
+    stop a run when the value becomes zero, use `slips`.
 
     **Arguments:** as for `slips`, without `options`.
 
@@ -1029,8 +1028,8 @@ def slips(
     """Return the event that a contact starts to slip.
 
     The event occurs when the `margin` falls to zero. Like every event, it needs a
-    change of sign: a contact that needs too much friction from the start does not
-    trigger the event. Therefore check the `margin` of the first state.
+    change of sign. It does not occur if the `margin` is negative from the start:
+    therefore check the `margin` of the first state.
 
     **Arguments:**
 

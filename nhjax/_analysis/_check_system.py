@@ -32,7 +32,7 @@ from .._system import (
 from ._motion import convert_to_velocities
 
 
-# A derivative counts as zero if it vanishes at this many states near the given one.
+# A derivative counts as zero if it vanishes at this many states near the given state.
 _NUM_SAMPLES = 3
 _SPREAD = 0.3
 
@@ -178,7 +178,7 @@ def check_system(
     rates = letters[:m] + [f"d{name}/dt" for name in letters[m:]]
     values = [*found["constraints"], *found["position_constraints"]]
     changes = {key: _changes(found[key]) for key in (_MASS, _JACOBIAN)}
-    # A row that is not finite is not reported as dependent: it makes the condition
+    # Only finite rows are reported as dependent. Any other row makes the condition
     # number of C infinite.
     rows = dependent_rows(found["jacobian"]) if found["deficient"] else []
     moving = np.any(_changes(found["by_position"]), axis=0)
@@ -289,15 +289,16 @@ def _derivatives(system, t, q, u, args, near) -> dict[str, Any]:
 
     by_time, by_position, second = jax.vmap(sample)(*near)
     rows = constraint_rows(t, jnp.zeros_like(u), u)
-    # If a constraint is the square of an expression, its row is zero in states that
-    # satisfy the constraint.
+    # If a constraint is the square of an expression, its row is zero at states that
+    # satisfy the constraint. Rows at nearby states show how small a zero row must be.
     rows_near = jax.vmap(constraint_rows, (None, 0, 0))(t, *near)
     elsewhere = jnp.max(jnp.abs(rows_near), axis=(0, 2))
     zero = jnp.finfo(u.dtype).eps ** 0.75 * elsewhere
     vanishes = jnp.max(jnp.abs(rows), axis=1) <= zero
     rows = jnp.where(vanishes[:, None], 0, rows)
     mass, rows = convert_to_velocities(system, hessian(t, jnp.zeros_like(u), u), rows)
-    # These values are only checked to be finite. Constraints are returned separately.
+    # For these values, the only check is that they are finite. Constraints are returned
+    # separately.
     values = {
         name: function(t, jnp.zeros_like(u), u)
         for name, function in functions.items()

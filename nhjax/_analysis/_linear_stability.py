@@ -77,9 +77,9 @@ def linear_stability(
     """Linearise the constrained equations of motion about a steady motion.
 
     A steady motion, or relative equilibrium, is an orbit of a one-parameter group of
-    symmetries of the system. Let x = (q, u), let ẋ = f(x) be the equations of motion,
-    whose multipliers follow from the time derivatives of the constraints, and let X be
-    the vector field that generates the symmetries. Then f - X vanishes at the state,
+    symmetries of the system. Let x = (q, u), and let ẋ = f(x) be the equations of
+    motion. Their multipliers follow from the time derivatives of the constraints. Let X
+    be the vector field that generates the symmetries. Then f - X vanishes at the state,
     and
 
     ż = A z,    A = W D(f - X) Z,
@@ -109,19 +109,19 @@ def linear_stability(
     - `positions`, `velocities`: the indices of the independent coordinates and of the
         independent velocities (of momenta for a Hamiltonian system), which form z. All
         other velocities must follow from the constraints: with m nonholonomic and k
-        holonomic constraints there are n - m - k independent velocities. Coordinates
-        that are not in `positions` and do not follow from holonomic constraints are not
+        holonomic constraints there are n - m - k independent velocities. Only
+        coordinates that are in `positions` or follow from holonomic constraints are
         perturbed. Omit coordinates on which the motion does not depend, such as the
         position of a wheel. By default, z consists of coordinates in an orthonormal
         basis of all perturbations that the constraints permit.
-    - `symmetry`: generators of symmetries: a function, like the `generator` of
-        `momentum_map`, that is called as `symmetry(q)` and returns vectors in the
-        components of the velocity, of shape (n,) or (k, n). On a group, the generator
-        of g -> g exp(εξ), a symmetry of the body, is the constant ξ. The generator of g
-        -> exp(εξ) g, a symmetry of space, is `manifold.Ad(manifold.inverse(q), xi)`.
-        The velocity must be a combination of the generators. If one generator is a
-        rotation and another is a translation that it rotates, include the translations
-        in all directions that this rotation produces.
+    - `symmetry`: a function that returns generators of symmetries, like the `generator`
+        of `momentum_map`. It is called as `symmetry(q)` and returns vectors of shape
+        (n,) or (k, n), in the components of the velocity. On a group, the generator of
+        g -> g exp(εξ), a symmetry of the body, is the constant ξ. The generator of g ->
+        exp(εξ) g, a symmetry of space, is `manifold.Ad(manifold.inverse(q), xi)`. The
+        velocity must be a combination of the generators. If one generator is a rotation
+        and another is a translation that it rotates, include the translations in all
+        directions that this rotation produces.
     - `must_be_steady`: whether to raise if the motion is not steady. Pass False to
         linearise at an instant, for instance along a trajectory.
 
@@ -193,9 +193,9 @@ def _drift_rates(
     """Compute the rates that vanish in a steady motion, and their bounds.
 
     In a steady motion, the chosen coordinates are constant; if none are chosen, all
-    velocities are constant. Their first and second time derivatives must vanish: when a
-    pendulum passes its lowest point, the first derivative of its velocity vanishes, but
-    not the second. The bounds allow for states that are accurate to a few digits only.
+    velocities are constant. Their first and second time derivatives must vanish. The
+    first alone is not enough: for the velocity of a pendulum, it also vanishes at the
+    lowest point. The bounds allow for states that are accurate to a few digits only.
     """
     dim = linearised.position_jacobian.shape[1]
     if independent is None:

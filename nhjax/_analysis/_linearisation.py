@@ -3,7 +3,7 @@
 A perturbation x = (ξ, w) changes the state (q, u) to (q τ(ξ), u + w). This file
 differentiates the equations with respect to x, in a frame that moves with the velocity
 or along symmetries. It also computes bases of the perturbations that the constraints
-permit, and checks that given generators are symmetries of the system, and that the
+permit. It checks that given generators are symmetries of the system, and that the
 motion is an orbit of these symmetries.
 """
 
@@ -214,7 +214,7 @@ def lift_generators(
     """Compute the generators ξ at q, and the rates δu of u under their flows.
 
     The flow of a vector field q ξ(q) transports velocities by its derivative, and
-    momenta by the inverse transpose of its derivative,
+    momenta by the inverse transpose of this derivative,
 
     δv = Dξ v + ad_v ξ,    δp = ad*_ξ p - Dξᵀ p,
 
@@ -265,7 +265,8 @@ def orthonormal_basis(rows: Array, orbit: Array) -> PermittedPerturbations:
 
     The basis is unique only up to a rotation, and the derivative of a singular value
     decomposition does not exist for equal singular values. Therefore the computed basis
-    is held fixed, and its derivative is the correction that keeps it in the kernel.
+    counts as constant. The derivative comes only from a correction that keeps the basis
+    in the kernel.
     """
     rows = jnp.concatenate([rows, orbit])
     count = rows.shape[0]

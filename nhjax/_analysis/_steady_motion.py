@@ -136,12 +136,12 @@ def steady_motion(
     - `max_iterations`: the largest number of iterations.
 
     **Returns:** a consistent `State`. With `symmetry`, a pair of the state and the
-    rates c of the generators, shape (k,), whose unit is the unit of the velocity
-    divided by the unit of the generator. Pass the state to `linear_stability` with the
-    same `symmetry`. Both results are twice differentiable with respect to `y` and
-    `args` by the implicit function theorem, if the steady motion is unique for the held
-    values, or unique up to ignorable coordinates. In other families the derivative is
-    the derivative of one more Newton increment.
+    rates c of the generators, shape (k,). The unit of a rate is the unit of the
+    velocity divided by the unit of the generator. Pass the state to `linear_stability`
+    with the same `symmetry`. Both results are twice differentiable with respect to `y`
+    and `args` by the implicit function theorem, if the steady motion is unique for the
+    held values, or unique up to ignorable coordinates. In any other family of
+    solutions, the derivative is the derivative of one more Newton increment.
 
     **Raises:** `NewtonError` if no steady motion is found near `y`. `ValueError` or
     `TypeError` if an index is wrong. `ValueError` if neither or both of the two ways
@@ -409,8 +409,8 @@ def least_norm_root(
     x, left = jax.lax.scan(refined, x, length=2)
     # An increment also vanishes if the free unknowns have no influence, so that the
     # residual must be checked too. The residual is compared with the sum of the
-    # absolute derivatives, each times the size of its unknown. An unknown without
-    # influence has size zero.
+    # absolute derivatives, each multiplied by the size of its unknown. An unknown
+    # without influence has size zero.
     sizes = jnp.where(
         jnp.any(jacobian != 0, axis=0), jnp.abs(start) + jnp.abs(stop_gradient(x)), 0
     )

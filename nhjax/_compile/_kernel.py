@@ -19,8 +19,8 @@ T = TypeVar("T")
 class TraceCache:
     """A cache of the traced programs of functions.
 
-    A key contains the function and the kinds of its arguments, but not other values. A
-    function of the user may read such values, and they may change between two calls of
+    A key contains the function and the kinds of its arguments, but not other values
+    that a function of the user may read. These values may change between two calls of
     `integrate`. A cache is therefore used only while one run is traced and
     differentiated.
     """

@@ -1,4 +1,4 @@
-"""An operation that tells the compiler with which carry an interrupted loop began.
+"""An operation that tells the compiler the initial carry of an interrupted loop.
 
 A run is a loop, and some numbers in its initial carry are constants, such as the zeros
 of a mass matrix. If no iteration changes such a number, it is a constant of the whole
@@ -26,9 +26,9 @@ loop_start.is_high = never_high
 
 
 def started_like(first: T, carry: T) -> T:
-    """Return `carry`, from which a loop continues that had the initial carry `first`.
+    """Return `carry`, to continue a loop whose initial carry was `first`.
 
-    Where a number of `first` is a constant of the program, and the loop does not change
+    If a number in `first` is a constant of the program, and the loop does not change
     this number, the compiler uses the constant. The values in `carry` must come from
     earlier iterations of the same loop, which started from `first`.
     """

@@ -1,7 +1,7 @@
 """The sum of products of two small arrays, as one operation until it is lowered.
 
 Without this operation, a product would be about five operations, and its derivatives
-several times as many. Tracing a gradient then took 15 to 40 percent longer.
+several times as many. Tracing a gradient would take 15 to 40 percent longer.
 """
 
 import itertools

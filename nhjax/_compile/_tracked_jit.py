@@ -30,8 +30,8 @@ import numpy as np
 from ..lanes import rare_collections
 
 
-# The owner of a value is the object that contains the value. The place of the value is
-# the identity of its owner, and a name or index in the owner.
+# The owner of a value is the object that contains the value. The place of the value
+# consists of the identity of its owner and a name or index in the owner.
 Place: TypeAlias = tuple[int, Hashable]
 # The owner of a value, its name in the owner, and the value.
 Part: TypeAlias = tuple[object, Hashable, Any]
@@ -144,7 +144,7 @@ def _key_name(key: Any) -> Hashable:
 
 
 def _parts(value: Any) -> Iterator[Part]:
-    """Yield the values inside a value, each after its owner and its name there."""
+    """Yield each value inside a value as (owner, name in the owner, value)."""
     if isinstance(value, types.FunctionType):
         yield from _read_by(value)
     elif isinstance(value, _MAPPINGS):

@@ -2,7 +2,7 @@
 
 A loop that saves its states writes each row of a buffer once. JAX's own update of an
 array cannot assume this: its derivative in reverse mode sets the row of the cotangent
-to zero, for which XLA copies the whole buffer in each iteration. With this update, the
+to zero, for which XLA copies the whole buffer in each iteration. With JAX's update, the
 time of a gradient would grow with the square of the number of rows.
 """
 

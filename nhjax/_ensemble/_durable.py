@@ -38,7 +38,7 @@ def write(path: Path, content: bytes) -> None:
 
 
 def write_if_different(path: Path, content: bytes) -> None:
-    """Write a file if its content differs; otherwise delete a leftover temporary."""
+    """Write a file if its content differs, else delete a leftover temporary file."""
     if path.read_bytes() == content:
         _temporary(path).unlink(missing_ok=True)
     else:
@@ -212,7 +212,7 @@ def _as_bytes(lines: list[Line]) -> bytes:
 
 
 def _complete_lines(path: Path) -> tuple[bytes, bool]:
-    """Read the complete lines; return also whether an incomplete one follows."""
+    """Read the complete lines; also return whether an incomplete line follows."""
     content = path.read_bytes()
     complete = content[: content.rfind(b"\n") + 1]
     return complete, len(complete) < len(content)

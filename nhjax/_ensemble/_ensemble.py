@@ -54,8 +54,8 @@ def ensemble(
     of a chunk over all devices. The last chunk is padded with members that are ignored.
 
     If `run` returns an `nhjax.Solution` or `nhjax.RESULTS`, alone or as part of a tree,
-    the outcome lists the members whose runs failed, and statistics leave them out. For
-    this, call `nhjax.integrate` with `throw=False`; otherwise the first failure ends
+    the outcome lists the members whose runs failed, and statistics leave them out. In
+    `run`, call `nhjax.integrate` with `throw=False`; otherwise the first failure ends
     the whole ensemble.
 
     After `jax.distributed.initialize`, all processes must make the same call. Each

@@ -49,8 +49,8 @@ class Layout(NamedTuple):
 class ChunkResult(NamedTuple):
     """The result of a chunk: codes of `RESULTS`, failed steps, and its content.
 
-    The content is the values of all members, or the arrays of them that reductions use,
-    or the states of reductions.
+    The content is the values of all members, or those of their arrays that reductions
+    use, or the states of reductions.
     """
 
     codes: Int[Array, " c"]
@@ -100,8 +100,9 @@ class Job:
     def states(self, chunk: int, reductions: Any) -> ChunkResult:
         """Start a chunk that returns states of reductions; do not wait for it.
 
-        The reductions are a program of their own, because it takes long to compile and
-        depends only on the shapes of the values. Runs with other methods share it.
+        The reductions are a separate program, which takes long to compile and depends
+        only on the shapes of the values. Runs with different methods can therefore
+        share this program.
         """
         is_member = np.arange(self.chunk_size) < self.num_members(chunk)
         inputs, is_member = self._on_devices((self._inputs(chunk), is_member))
@@ -192,7 +193,7 @@ class Members:
 
 
 class _MemberFromArrays(eqx.Module):
-    """Create a member from its leaves, and its random keys from their integer data."""
+    """Create a member from its leaves; its random keys are stored as integers."""
 
     treedef: Any = eqx.field(static=True)
     keys: tuple[Any, ...] = eqx.field(static=True)

@@ -66,7 +66,7 @@ class Mean(AbstractReduction):
     - `of`: a function that selects, from the value of a member, the part to average;
         by default everything.
 
-    **Returns:** the outcome has a tree with the shapes of the value of one member.
+    **Returns:** `statistics` is a tree with the shapes of the value of one member.
 
     !!! example
 
@@ -120,7 +120,7 @@ class Variance(AbstractReduction):
         default everything.
     - `ddof`: the number subtracted from the number of members, 1 by default.
 
-    **Returns:** the outcome has a tree with the shapes of the value of one member.
+    **Returns:** `statistics` is a tree with the shapes of the value of one member.
 
     **Raises:** `ValueError` if there are `ddof` members or fewer.
 
@@ -509,8 +509,8 @@ def _fold_vectors(
 ) -> Any:
     """Add the members of a chunk to a state, with all numbers of a dtype as one vector.
 
-    XLA compiles an expression for each array, and sums of double-double numbers are
-    long expressions.
+    This saves compile time: XLA compiles an expression for each array, and sums of
+    double-double numbers are long expressions.
     """
     values = jax.tree.map(lambda x: x.astype(_sum_dtype(x)), values)
     number, *trees = state
@@ -578,7 +578,7 @@ def double_double(x: Float[Array, "*n"]) -> DoubleDouble:
 def add(a: DoubleDouble, b: DoubleDouble) -> DoubleDouble:
     """Add two double-double numbers, with a relative error of about 2^-104 in float64.
 
-    This is Knuth's TwoSum of both parts (Hida, Li, Bailey, 2001, *Algorithms for
+    Knuth's TwoSum is applied to both parts (Hida, Li, Bailey, 2001, *Algorithms for
     quad-double precision floating point arithmetic*). Infinite numbers add as in IEEE
     arithmetic: their rounding errors, which would be NaN, are replaced by zero.
     """

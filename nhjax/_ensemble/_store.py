@@ -93,7 +93,7 @@ class ZarrSink(AbstractSink):
             raise
 
     def remaining_chunks(self) -> Iterable[int]:
-        """Return this process's share of the chunks without a line in the journal."""
+        """Return this process's share of the chunks that are not in the journal."""
         processes = self.job.processes
         left = [k for k in range(self.job.num_chunks) if k not in self.lines]
         return left[processes.index :: processes.count]
@@ -270,7 +270,7 @@ class ZarrSink(AbstractSink):
 class CheckpointedReductionSink(AbstractSink):
     """Writes the states of reductions to a folder after each round of chunks.
 
-    The state, the failures and the number of finished chunks are one file, which
+    The state, the failures and the number of finished chunks are in one file, which
     process 0 replaces atomically.
     """
 
@@ -303,7 +303,7 @@ class CheckpointedReductionSink(AbstractSink):
             self.inner.restore(first_chunk, content[8:])
 
     def remaining_chunks(self) -> Iterable[int]:
-        """Return the chunks of this process after the last finished one."""
+        """Return the chunks of this process after the last finished chunk."""
         return self.inner.remaining_chunks()
 
     def start(self, chunk: int) -> ChunkResult:

@@ -135,7 +135,7 @@ class _Case(NamedTuple):
 
 
 def judged(found: Found) -> list[BoolScalar | np.bool_]:
-    """Return whether each condition on an initial state holds, as in `list_checks`."""
+    """Return whether each condition of `list_checks` holds, in the same order."""
     state, lin = found.state, found.lin
     singular = 10 * state.v.shape[0] * jnp.finfo(state.v.dtype).eps
     values = found.generator, found.regularity, lin.violation, found.positions
@@ -362,7 +362,7 @@ def _unreached(
     missed = "the projection did not reach them"
     if fixed is None:
         return missed
-    # The part of the violation that no change of the free components removes.
+    # The part of the violation that no change of the free components can remove.
     left = fixed.projector @ (violation / fixed.sizes)
     rows = [a for a, x in enumerate(left) if abs(x) > allowed[a] / fixed.sizes[a]]
     if not rows:

@@ -57,7 +57,7 @@ from ._projection import (
 )
 
 
-# The largest number of coordinates with which one kernel computes an initial state and
+# The largest number of coordinates for which one kernel computes an initial state and
 # its checks.
 _LARGEST_WHOLE = 12
 
@@ -90,8 +90,9 @@ def initial_state(
     - `system`: the mechanical system.
     - `q`: the configuration, shape (n,), floating point; on a group an element, on a
         product of groups a tuple of elements.
-    - `v`, `p`: velocity or momentum, shape (n,) with n the dimension of the manifold,
-        of the dtype of q; on a group in the body frame. Give exactly one.
+    - `v`, `p`: the velocity or the momentum, of shape (n,) and of the dtype of q, where
+        n is the dimension of the manifold; on a group in the body frame. Give exactly
+        one.
     - `t`, `args`: passed on to the functions of the system, as in `integrate`.
     - `project`: whether to replace q by the nearest configuration, and then v by the
         nearest velocity, that satisfies the constraints. Distances are measured in the
@@ -118,7 +119,7 @@ def initial_state(
     - `TypeError`: `system`, `project`, `keep_q`, `keep_v`, `keep_p` or a part of `args`
         is of a wrong type.
     - `ValueError`: `v` and `p` are both given or both left out; a component to keep is
-        unknown, or chosen twice or without `project=True`.
+        unknown, chosen twice, or chosen without `project=True`.
     - `ShapeError`, `DTypeError`, `NonFiniteError`: an argument, or the value of one of
         the system's functions, has a wrong shape or dtype, or is not finite.
     - `ConstraintViolationError`: a constraint is violated, or `q` is not on the group,
@@ -183,8 +184,8 @@ def _solve(
     """Compute the state and the numbers for its checks, and judge them."""
     system = with_kept_functions(system, t, q, p if v is None else v, args)
     given = system, t, q, v, p, args, project, keep
-    # A large program, or one that calls LAPACK as the projection with kept components
-    # does, is compiled in less time in parts.
+    # A large program compiles faster in parts. So does a program that calls LAPACK,
+    # such as the projection with kept components.
     keeps_any = any(kept.indices for kept in keep)
     if keeps_any or system.manifold_of(q).dim > _LARGEST_WHOLE:
         return _found_and_judged(*given)

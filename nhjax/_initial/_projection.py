@@ -230,7 +230,7 @@ class Fixed(NamedTuple):
 
     - `sizes`: the sizes of the derivatives of the constraints.
     - `projector`: the projector onto the combinations that are constant, to first
-        order, when the other components change.
+        order, when only the components that are not kept change.
     - `slopes`: the derivatives of the constraints along the kept components.
     """
 
@@ -284,7 +284,7 @@ def project_position(system, t, q, u, args, kept: Kept, given: PyTree[Array]):
     nearest = _nearest_keeping(mass, gamma, held, zero, sizes, terms, is_redundant)
     # A condition such as w = 1 on a unit quaternion has zero derivative where it holds.
     # A search that starts there leaves the condition out of its equations, and can
-    # converge although the condition is violated.
+    # converge to a point that violates the condition.
     moved = manifold.act(q, nearest.x)
     size = max_norm(*jax.tree.leaves(stop_gradient((q, moved))))
     off = max_norm(stop_gradient(held(nearest.x)))

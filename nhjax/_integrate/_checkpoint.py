@@ -26,7 +26,7 @@ MOST_STEPS = 2**31 - 1
 
 
 class Checkpoint(eqx.Module):
-    """All data that a later run needs to continue a run bit for bit.
+    """All data that a later run needs to continue an earlier run bit for bit.
 
     A `State` is not enough for this. The run adds up q and p by compensated sums, and
     also carries the rounding errors of these sums. The times t_k = t0 + k dt depend on
@@ -51,9 +51,9 @@ class Checkpoint(eqx.Module):
     The bits of a result depend on the compiled instructions. A run in parts equals a
     run in one piece bit for bit if all runs save the same output and use the same
     releases of JAX and nhjax on the same machine. Under `jit` the run in one piece must
-    also save a checkpoint, because all parts except the last save one. Otherwise the
-    results agree up to round-off. Dense output and the samples of `SaveAt(ts=...)` also
-    agree only up to round-off, because each part counts their times from its own start.
+    also save a checkpoint, as all parts except the last do. Otherwise the results agree
+    up to round-off. Dense output and the samples of `SaveAt(ts=...)` also agree only up
+    to round-off, because each part counts time from its own start.
 
     !!! example
 
@@ -220,8 +220,8 @@ def _agree(old: Linearisation, new: Linearisation) -> BoolScalar:
         )
     ]
     # The bound is far above eps, because an ill-conditioned inverse has few correct
-    # digits. If the matrices differ by less, the stage solver converges equally well
-    # with the Jacobian of the checkpoint as with a fresh Jacobian.
+    # digits. If the matrices differ by less, the stage solver converges as well with
+    # the Jacobian of the checkpoint as with a fresh Jacobian.
     small = float(jnp.finfo(pairs[0][0].dtype).eps) ** 0.25
     close = [max_norm(x - y) <= small * (max_norm(x) + max_norm(y)) for x, y in pairs]
     return jnp.all(jnp.stack(close))

@@ -25,7 +25,7 @@ from ._checkpoint import MOST_STEPS
 from ._progress_meter import AbstractProgressMeter
 
 
-# How many numbers the buffers of a chunk hold, and the limits of their number of rows.
+# The number of entries in the buffers of a chunk, and the limits of the number of rows.
 _BUFFER_SIZE = 2**17
 _LEAST_ROWS, _MOST_ROWS = 16, 4096
 # Unless a progress meter sets the lengths of chunks, the first chunk has at most
@@ -34,7 +34,7 @@ _FIRST_ITERATIONS = 256
 _SECONDS = 0.2
 # One call computes the output at this many of the times of `SaveAt(ts=...)`.
 SAMPLES_AT_ONCE = 64
-# The stride of a run that saves no output after steps.
+# The stride of a run in which no step saves output.
 NO_STRIDE = MOST_STEPS
 
 

@@ -36,8 +36,8 @@ from .._system import (
 # `_SAMPLES` states near it. `_SPREAD` is the size of the random displacements that lead
 # to these states.
 _SAMPLES, _SPREAD = 3, 0.3
-# The number of Newton iterations that move these states onto constraints on velocities,
-# which may be nonlinear.
+# The number of Newton iterations that move these states onto the constraints on
+# velocities. These constraints may be nonlinear.
 _ITERATIONS = 5
 # If a rate of change is below this many units of round-off per step, it is ignored.
 _UNITS = 1e3

@@ -92,8 +92,8 @@ from ._step_sizes import (
 METHODS = LobattoIIIAB, Gauss, PartitionedRungeKutta
 
 # A call outside of transformations warns if the estimated error of a step, relative to
-# the change of the state in it, exceeds this value. For large steps this ratio tends to
-# one.
+# the change of the state in the step, exceeds this value. For large steps this ratio
+# tends to one.
 _TOO_LARGE_ERROR = 0.9
 
 _TOO_LARGE = (
@@ -718,7 +718,7 @@ def _standstill_error(first: Any, h: Any) -> ValueError:
 
 
 # The function `get_opaque_trace_state` of JAX returns a value that identifies the
-# current transformations, and can only be compared with another such value. In releases
+# current transformations. Such values can only be compared with each other. In releases
 # of JAX in which this function is not public, `_is_tracing` is always True.
 _trace_state = getattr(jax.extend.core, "get_opaque_trace_state", lambda **_: object())
 with jax.ensure_compile_time_eval():

@@ -111,7 +111,7 @@ class Loop(eqx.Module):
         return eqx.tree_at(lambda x: x.step_state.state, carry, state)
 
     def no_rows(self, carry: AbstractCarry) -> Rows:
-        """Return the zeros that an iteration after the end saves, and `write` drops."""
+        """Return zeros as rows of an iteration after the end; `write` drops them."""
         rows = jax.tree.map(
             lambda x: jnp.zeros(x.shape, x.dtype), self.row_shapes(carry)
         )
@@ -189,10 +189,9 @@ class DirectAdjoint(AbstractAdjoint):
     !!! note
 
         This differs from the `DirectAdjoint` of diffrax, which nests scans and
-        checkpoints up to a maximum number of steps, and which diffrax advises against.
-        In nhjax the number of steps, or with a controller a limit for it, is known
-        before the run. A plain loop therefore runs all steps, and this adjoint is the
-        default.
+        checkpoints up to a maximum number of steps; diffrax advises against using it.
+        In nhjax the number of steps (with a controller, a limit for it) is known before
+        the run. A plain loop therefore runs all steps, and this adjoint is the default.
 
     !!! example
 
@@ -234,7 +233,7 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
         This differs from the `RecursiveCheckpointAdjoint` of diffrax. In diffrax a
         binomial scheme places checkpoints while the number of steps is not yet known,
         takes log(max_steps) checkpoints by default, and allows reverse mode only. In
-        nhjax the number of steps, or with a controller a limit for it, is known, and
+        nhjax the number of steps (with a controller, a limit for it) is known, and
         blocks have equal length. `checkpoints` is the number of blocks on one level.
         The default is faster than the default of diffrax, and needs more memory.
 

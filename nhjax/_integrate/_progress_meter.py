@@ -172,7 +172,7 @@ class TqdmProgressMeter(AbstractProgressMeter):
         """Move the bar to `done` steps, and close it at the end of the run."""
         bar = self._open.bars.get(total)
         if bar is None:
-            # Steps before the bar opened must not count for the speed that it shows.
+            # The speed that the bar shows must not count steps before the bar opened.
             bar = self._open.bars[total] = tqdm.tqdm(
                 total=total,
                 initial=done,

@@ -22,13 +22,13 @@ class ReversibleAdjoint(AbstractAdjoint):
     """Store only the end of the run and retrace the steps from there: memory O(1).
 
     If the method is symmetric, a step of -h leads back to the start of a step of h.
-    With the consistent closure, and on a group with the chart at the start of a step, a
-    step of -h leads back only up to a small error. In these cases an iteration that
-    starts from the step of -h inverts the step.
+    There are two exceptions, in which a step of -h leads back only up to a small error:
+    the consistent closure, and on a group the chart at the start of a step. Then an
+    iteration that starts from the step of -h inverts the step.
 
     The retraced states differ from the states of the run by round-off. If a set
-    attracts the motion, as for a sleigh, it repels the motion in reversed time, and the
-    differences grow as fast as the motion decays. In that case prefer
+    attracts the motion, as for a sleigh, this set repels the motion in reversed time,
+    and these differences grow as fast as the motion decays. In that case prefer
     `RecursiveCheckpointAdjoint`. This adjoint allows only reverse mode and forward over
     reverse mode: `jax.jvp` needs one of the other two adjoints. Gradients are also
     available if `num_steps` is an array.
@@ -60,8 +60,8 @@ def _run(arguments: tuple[Loop, AbstractCarry]) -> tuple[AbstractCarry, Rows]:
 @_run.def_fwd
 def _run_fwd(perturbed, arguments):
     del perturbed
-    # `_run` is not called here: it has a custom rule for reverse mode, so that forward
-    # mode could not differentiate this reverse mode.
+    # `_run` is not called here: it has a custom rule for reverse mode, which forward
+    # mode cannot differentiate.
     carry, rows = DirectAdjoint().run(*arguments)
     # The backward pass needs only the shapes of the buffers, and the log.
     shapes = jax.eval_shape(lambda: rows)

@@ -347,8 +347,8 @@ def _chunk(
 
     def steps(loop: Loop, carry: AbstractCarry, log: Any, start: Any, end: Any):
         # Entries of the linearisation that are constant in the first step are constant
-        # in all steps. Its matrices are traced at the present state to find these
-        # entries, but the compiled program does not compute the matrices.
+        # in all steps. To find these entries, the matrices are traced at the present
+        # state, but the compiled program does not compute them.
         plain, state = loop.stepper.plain, carry.step_state.state
         u = plain.system.fibre_coordinate(state)
         given = plain.system, plain.time(0), state.q, u, plain.args
@@ -597,8 +597,8 @@ def _all_steps(
 ) -> tuple[PyTree[Array] | None, AbstractCarry, Rows]:
     """Take all steps; return the saved start, the last carry and the saved rows."""
     # If the steps call the function `fn` of `SaveAt`, their kernel also calls it for
-    # the start. Otherwise `fn` is called outside, and the engine that compiles the
-    # steps does not depend on `fn`.
+    # the start. Otherwise `fn` is called outside of this kernel, so that the engine
+    # that compiles the steps does not depend on `fn`.
     is_inside = bool(saveat.steps)
 
     def saved(loop: Loop, t0: FloatScalar, y: State) -> PyTree[Array] | None:
@@ -640,8 +640,8 @@ def _noise(stepper: AbstractStepper[Any, Any], y0: State | Checkpoint) -> Functi
     if isinstance(y0, Checkpoint):
         return jax.lax.stop_gradient(FunctionNoise(*y0.round_off))
     # The noise is measured in its own kernel for two reasons. A loop over steps is
-    # compiled to faster code if its kernel contains no other loop before it. In a batch
-    # of runs from one state, this kernel is not batched.
+    # compiled to faster code if its kernel contains no other loop before it. If all
+    # runs of a batch start from one state, this kernel is not batched.
     plain = stepper.plain
     u = plain.system.fibre_coordinate(y0)
     given = plain.system, plain.time(0), y0.q, u, y0.multiplier, plain.args, plain.dt

@@ -259,8 +259,8 @@ def record_places(
     length = static_length(num_steps)
     if dense or sampled is None:
         return RecordPlaces(length, jnp.arange(length + 1, dtype=jnp.int32))
-    # The buffer has one row for each sample, but samples in the same step use only the
-    # row of the first of them. There may be more or fewer steps than samples.
+    # The buffer has one row for each sample, but samples in the same step share the row
+    # of the first such sample. There may be more or fewer steps than samples.
     number = sampled.shape[0]
     slots = jnp.full((length + 1,), number, jnp.int32)
     first = slots.at[sampled].min(jnp.arange(number, dtype=jnp.int32))

@@ -59,7 +59,7 @@ class Solution(eqx.Module):
         stage solver's own iteration had failed),
         `num_rejected_steps` (only in a run with variable steps: the number of attempts
         at a step that were repeated with another size),
-        `num_unsolved_steps` (also only in such a run: the number of these attempts
+        `num_unsolved_steps` (only in such a run: the number of these repeated attempts
         whose equations were not solved),
         `max_error_over_tolerance` (only with `PIDController`: the largest estimated
         error of an accepted step, in units of its tolerance),
@@ -101,8 +101,8 @@ class Solution(eqx.Module):
 
     t0: Float[Array, ""]
     t1: Float[Array, ""]
-    # `PyTree` includes None, the empty tree: so type checkers do not require users to
-    # test for None.
+    # `PyTree` includes None, the empty tree, so that type checkers do not require users
+    # to test for None.
     ts: PyTree[Float[Array, " k"]]
     ys: PyTree[Array]
     stats: dict[str, Any]

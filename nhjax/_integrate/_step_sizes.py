@@ -387,8 +387,8 @@ class PIDController(AbstractStepSizeController):
     ) -> tuple[FloatScalar, Memory, RESULTS]:
         """Return `dt` or, if None, a size that changes the state by one percent."""
         # Before the first step there are no earlier errors, sizes and growth rates. The
-        # logarithms of the errors are taken as zero, the size as zero, so that no trend
-        # is predicted, and the growth rates as infinite, which means unknown.
+        # logarithms of the errors start as zero. The size starts as zero, so that no
+        # trend is predicted. The growth rates start as infinite, which means unknown.
         zero = jnp.zeros((), t.dtype)
         memory = zero, zero, zero, jnp.full(2, jnp.inf, t.dtype)
         if context.dt is not None:
@@ -459,8 +459,8 @@ class PIDController(AbstractStepSizeController):
             *(start, outcome, scales, context.args, growth_rates),
         )
         error, found, size = jax.lax.stop_gradient((error, found, jnp.abs(h)))
-        # The growth rate of a single step may be small by chance. The stored growth
-        # rate therefore falls by at most half in each step.
+        # The growth rate of a single step may be small by chance. Therefore the stored
+        # growth rate at most halves in each step.
         is_first = jnp.isinf(growth_rates)
         growth_rates = jnp.where(
             is_first, found, jnp.maximum(found, 0.5 * growth_rates)
@@ -483,9 +483,9 @@ class PIDController(AbstractStepSizeController):
         error = jnp.maximum(error, bound)
         powers = (p + i + d) * error - (p + 2 * d) * last + d * before_last
         factor = -powers / number
-        # If errors grow, the next size is reduced in advance. Without this, a quarter
-        # of the steps of an orbit with close passes were rejected. A very small earlier
-        # error may be due to chance.
+        # If errors grow, the next size is reduced in advance. Otherwise a quarter of
+        # the steps of an orbit with close passes were rejected. An earlier error below
+        # 0.01 counts as 0.01, because it may be small by chance.
         growth = jnp.maximum(last, math.log(0.01)) - error
         change = jnp.log(size / jnp.where(last_size > 0, last_size, size))
         trend = change + growth / number
@@ -757,7 +757,8 @@ def position_sizes(
     """Return the sizes of the n coordinates of a position, in the shape of `like`.
 
     On a vector space the sizes are |q|. An element of another group may have more than
-    n numbers, and all n sizes are equal to the largest absolute value among them.
+    n numbers; then each of the n sizes is the largest absolute value among these
+    numbers.
     """
     leaves = [jnp.ravel(jnp.abs(x)) for x in jax.tree.leaves(q)]
     flat = jnp.concatenate(leaves)

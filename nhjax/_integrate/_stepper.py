@@ -465,10 +465,10 @@ def step_back(
         return back_from(step_state)
 
     # The unknown is the state z from which a step back starts. Each iteration takes
-    # this step from z to a state y, and then a step forward from y. It moves z by the
-    # difference between `step_state` and the end of the forward step. The two steps
-    # undo each other up to a small error, so this iteration converges far faster than
-    # an iteration with the unknown y.
+    # this step from z to a state y, and then a step forward from y. The iteration then
+    # moves z by the difference between `step_state` and the end of the forward step.
+    # The two steps undo each other up to a small error, so this iteration converges far
+    # faster than an iteration with the unknown y.
     target = step_state.state
     manifold = stepper.system.manifold_of(target.q)
     propagated = stepper.method.carries_multiplier
@@ -516,10 +516,10 @@ def is_consistent(
     """Return whether a state is consistent, up to small errors.
 
     A consistent state lies on the group and satisfies the constraints, and the Legendre
-    transform maps its v to its p. `violations` are the constraint violations that count
-    as round-off. The bound on the errors is small enough to detect a state of another
-    system, or a state of which only one part was changed. It is large enough for the
-    perturbations of finite differences.
+    transform maps its v to its p. `violations` are the largest constraint violations
+    that count as round-off. The bound on the errors is small enough to detect a state
+    of another system, or a state of which only one part was changed. It is large enough
+    for the perturbations of finite differences.
     """
     y, lin = start.state, start.lin
     small = float(jnp.finfo(y.p.dtype).eps) ** 0.25

@@ -204,7 +204,7 @@ class AbstractLieGroup(eqx.Module):
         return self.Ad_dual(self.retract(xi), mu)
 
     def to_end_change(self, xi: Vector, mu: Vector) -> Vector:
-        """Compute Ad_{τ(ξ)}^* μ - μ; subclasses may avoid cancellation."""
+        """Compute Ad_{τ(ξ)}^* μ - μ; subclasses may do this without cancellation."""
         return self.to_end(xi, mu) - mu
 
     def to_start(self, xi: Vector, mu: Vector) -> Vector:
@@ -212,7 +212,7 @@ class AbstractLieGroup(eqx.Module):
         return self.Ad_dual(self.inverse(self.retract(xi)), mu)
 
     def to_start_change(self, xi: Vector, mu: Vector) -> Vector:
-        """Compute Ad_{τ(ξ)⁻¹}^* μ - μ; subclasses may avoid cancellation."""
+        """Compute Ad_{τ(ξ)⁻¹}^* μ - μ; subclasses may do this without cancellation."""
         return self.to_start(xi, mu) - mu
 
     def ad_dual(self, xi: Vector, mu: Vector) -> Vector:

@@ -312,8 +312,8 @@ class FramedPose(eqx.Module):
     """A pose (x, y, θ) together with cos θ and sin θ, the frame of the body.
 
     It replaces a pose inside a step to avoid trigonometric functions. The retraction
-    gives the cosine and sine of the angle between two poses. From these, products give
-    the frame of the second pose from the frame of the first pose.
+    gives the cosine and sine of the angle between two poses. The frame of the second
+    pose then follows from the frame of the first pose by products.
     """
 
     pose: Float[Array, "3"]

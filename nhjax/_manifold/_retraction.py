@@ -183,7 +183,7 @@ class Exponential(AbstractRetraction):
     ) -> tuple[FloatScalar | float, FloatScalar | float]:
         """Compute α = (θ/2) cot(θ/2) and γ = (1 - α)/θ² of dτ⁻¹, with θ² = s."""
         c = stumpff(0.25 * s, 4)
-        # The identity c_1 - c_0 = θ²/4 (c_2 - c_3) of the values at θ²/4 avoids
+        # For values c_k at θ²/4, the identity c_1 - c_0 = θ²/4 (c_2 - c_3) avoids
         # cancellation in 1 - α.
         return c[0] / c[1], 0.25 * (c[2] - c[3]) / c[1]
 

@@ -456,7 +456,7 @@ def _extend_by_dual_numbers(function, xi: Twist, eta: Twist) -> Twist:
 
 def dot(a: Float[Array, " n"], b: Float[Array, " n"]) -> Float[Array, ""]:
     """Compute the scalar product a·b of two vectors."""
-    # XLA fuses a sum with the operations around it, but not a matrix product.
+    # XLA fuses a sum with the operations around it, but does not fuse matrix products.
     return jnp.sum(a * b)
 
 

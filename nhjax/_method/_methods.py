@@ -72,7 +72,8 @@ class ClosureWeights:
     - `end`: shape (s,), the weights of the continuous multiplier λ_c(q_{k+1}, p_{k+1}).
     - `response`: shape (s-1,), the change of y that compensates a change of λ_{k+1} by
         one, so that Σ_j a_ij Λ^j, i >= 2, do not change.
-    - `stage_response`: shape (s,), the change of Σ_j â_ij Λ^j under both changes.
+    - `stage_response`: shape (s,), the change of Σ_j â_ij Λ^j if λ_{k+1} changes by one
+        and y by `response`.
     """
 
     E: np.ndarray
@@ -132,7 +133,8 @@ class AbstractMethod(eqx.Module):
         """Return the order of q and p in systems without constraints.
 
         Up to 8, the order follows from the order conditions of the pair (a, â). Above
-        8, the order is min(p, 2r + 2) of B(p) and D(r), which agrees with measurements.
+        8, the order is min(p, 2r + 2) with the largest p and r for which B(p) and D(r)
+        hold, as measurements confirm.
         """
         return _order_conditions.order(self._tableau())
 
@@ -140,10 +142,10 @@ class AbstractMethod(eqx.Module):
     def constrained_order(self) -> int:
         """Return the order of q and p in systems with constraints.
 
-        It is min(p, 2r + 2) of B(p) and D(r), or the order without constraints if this
-        order is smaller. For collocation on nodes that include 0 and 1, such as
-        Lobatto's, the page on closures proves that the order is at least 2r + 2; runs
-        of many tableaux show that it is not higher.
+        With p and r as for `order`, it is min(p, 2r + 2), but at most the order without
+        constraints. For collocation on nodes that include 0 and 1, such as Lobatto's,
+        the page on closures proves that the order is at least 2r + 2; runs of many
+        tableaux show that it is not higher.
 
         **Raises:** `ValueError`, as `require_constraint_hypotheses` does.
         """
@@ -327,7 +329,7 @@ class LobattoIIIAB(AbstractMethod):
             the previous step as Λ^1. `"consistent"` uses the continuous multiplier at
             the start of the step as Λ^1. `"symmetric"` uses the continuous multipliers
             at both ends of the step, with one more unknown that makes the step
-            symmetric; a step then depends on its initial state only.
+            symmetric; a step then depends only on its initial state.
         - `chart`: the origin of the chart of a step on a Lie group. With `"middle"` a
             step with the increment ξ leads from -ξ/2 to ξ/2 in its chart; the step is
             symmetric, and symplectic if there are no constraints. With `"start"`, the
@@ -353,10 +355,9 @@ class LobattoIIIAB(AbstractMethod):
 
         With more stages, steps can be larger, which saves time if errors must be small.
         With the returned number of stages, the error at the end of a run was most often
-        within a factor of ten of `rtol`. With one or two stages more, a run takes
-        less time for the same error, but needs a larger `rtol`, because the error is
-        often far smaller than `rtol`.
-        `benchmarks.adaptive_steps` measured both facts.
+        within a factor of ten of `rtol`. With one or two stages more, a run takes less
+        time for the same error, but the error is often far smaller than `rtol`, so that
+        a larger `rtol` must be chosen. `benchmarks.adaptive_steps` measured both facts.
 
         **Arguments:**
 
@@ -550,7 +551,7 @@ def multiplier_closure_weights(t: Tableau, symmetric: bool) -> ClosureWeights:
     else:
         for i in range(1, s):
             e[i, i - 1] = context().one
-    # Both responses are used in an approximate Jacobian only: float64 suffices.
+    # Both responses are used only in an approximate Jacobian: float64 suffices.
     weights, last = to_float64(e), to_float64(end)
     response = -np.linalg.solve(t.a[1:] @ weights, t.a[1:] @ last)
     return ClosureWeights(

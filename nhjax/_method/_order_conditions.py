@@ -116,8 +116,9 @@ def order(t: Tableau) -> int:
     """Find the order of the pair (a, â) in systems without constraints.
 
     The conditions of trees are checked in float64 to 1e-12. If all conditions up to
-    order 8 hold, the order is min(p, 2r + 2) of B(p) and D(r). This is the order of
-    Gauss and Lobatto methods, and agrees with measurements for other tableaux.
+    order 8 hold, the order is min(p, 2r + 2) with the largest p and r for which B(p)
+    and D(r) hold. This is the order of Gauss and Lobatto methods; for other tableaux,
+    measurements confirm it.
     """
     found = partitioned_order((t.a, t.a_hat), t.b, 1e-12, _MAX_TREE_ORDER)
     if found < _MAX_TREE_ORDER:
@@ -247,9 +248,8 @@ def _products(
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Generate all trees with `size` vertices besides the root.
 
-    The branches at the root are taken from `branches[:end]`. For each tree, the
-    function yields the product of the γ of its branches, and `values` times the φ of
-    the tree.
+    The branches at the root are taken from `branches[:end]`. For each tree τ, the
+    function yields the product of the γ of its branches, and `values` times φ(τ).
     """
     if size == 0:
         yield 1, values

@@ -9,8 +9,8 @@ Numerical Integration", II.1.2). The symplectic conjugate is â_ij = b_j (1 - a_
 (ibid., VI.4.1); the conjugate of Lobatto IIIA is Lobatto IIIB.
 
 For dense output, the Lagrange basis is expanded in Legendre polynomials of x = 2θ - 1,
-ℓ_j(θ) = Σ_n K_nj P_n(x). The coefficients K_nj are of order one for every s, whereas
-the coefficients of monomials would cancel. The integral of the basis is
+ℓ_j(θ) = Σ_n K_nj P_n(x). The coefficients K_nj are of order one for every s; sums of
+monomials would have large terms that cancel. The integral of the basis is
 
     ∫_0^θ ℓ_j = θ K_0j - 2 θ (1 - θ) Σ_{n>=1} K_nj P_n'(x) / (n (n + 1)),
 
@@ -151,8 +151,8 @@ def _collocation(points: list[Number]) -> Tableau:
     a = context().matrix(s, s)
     for i in range(s):
         for j in range(s):
-            # Average a_ij with its reflection b_j - a_{s+1-i,s+1-j}, which equals it in
-            # exact arithmetic, so that the result is exactly symmetric.
+            # In exact arithmetic a_ij equals its reflection b_j - a_{s+1-i,s+1-j}. The
+            # average of both is exactly symmetric.
             a[i, j] = (raw[i, j] + b[j] - raw[s - 1 - i, s - 1 - j]) / 2
     if points[0] == -1:
         # The integrals to c_1 = 0 and c_s = 1 are known exactly.

@@ -3,8 +3,9 @@
 For matrices of a few rows, calling a library of linear algebra is too expensive. Inside
 a time loop the calls cost more than the arithmetic. The calls cannot be compiled into
 one kernel with the operations around them, and a batch of calls runs one by one. Up to
-a limit of size, `small_einsum` consists of elementary operations. `with_small_products`
-replaces the products in the functions of a user by `small_einsum`.
+a size limit, `small_einsum` therefore consists of elementary operations.
+`with_small_products` replaces the products in the functions of a user by
+`small_einsum`.
 """
 
 import math

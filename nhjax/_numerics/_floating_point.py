@@ -80,7 +80,7 @@ def two_sum(
 
 
 def uneven_perturbations(q: PyTree[Array]) -> PyTree[Array]:
-    """Return a perturbation of each number in q, of half to all of the number's size.
+    """Return a perturbation of each number in q, of 0.5 to 1 times the number's size.
 
     The perturbations differ and have both signs, so that they hardly cancel in
     differences and sums of a few numbers. Relative perturbations are ±(1 - x/2). The x

@@ -282,7 +282,8 @@ def root(
                 skip=solved.converged,
             )
             solved = tree_where(solved.converged, solved, again)
-        # `custom_root` needs floats in `aux`, because it makes tangents of their dtype.
+        # `custom_root` needs floats in `aux`, because it creates tangents of the same
+        # dtypes.
         outcome = (solved.converged, solved.exhausted, solved.num_iterations)
         return solved.x, jax.tree.map(lambda z: z.astype(x.dtype), outcome)
 

@@ -1,10 +1,10 @@
 """Inverses of small matrices, and loops over their rows, in elementary operations.
 
 As for products (`_contraction`), calling a library of linear algebra inside a time loop
-is too expensive for matrices of a few rows. Up to a limit of size, all functions here
-consist of elementary operations. Their loops keep the program short: the length of the
-program does not grow with the number of blocks, and for most functions not with the
-number of rows.
+is too expensive for matrices of a few rows. Up to a size limit, all functions here
+therefore consist of elementary operations. Their loops keep the program short: the
+length of the program does not grow with the number of blocks, and for most functions
+not with the number of rows.
 """
 
 from collections.abc import Callable
@@ -64,8 +64,8 @@ def _inverse_jvp(primals, tangents):
 def compiled_once_inverse(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
     """Invert a matrix by Gauss-Jordan elimination in place, with row pivoting.
 
-    Because of its name, `nhjax.lanes` compiles this function once for all matrices of
-    the same size, if they have fewer than `_BY_ROWS_FROM` rows.
+    `nhjax.lanes` recognises this function by its name, and compiles it once for all
+    matrices of the same size if they have fewer than `_BY_ROWS_FROM` rows.
     """
     rows = jnp.arange(matrix.shape[0])
 
@@ -110,10 +110,10 @@ def _sum_of_rows(rows: Float[Array, "k n"]) -> Float[Array, " n"]:
     return reduce(jnp.add, [jnp.sum(part, axis=0) for part in parts])
 
 
-# An inverse of at least `_BY_ROWS_FROM` rows is one operation until it is lowered. XLA,
-# for which each operation in a loop has a high cost, computes the operations on the
-# whole matrix, which are the parameter `program`. `nhjax.lanes` replaces the operation
-# by its implementation, traced, which has loops over rows.
+# An inverse of at least `_BY_ROWS_FROM` rows is one operation until it is lowered. In
+# XLA, each operation in a loop is expensive. XLA therefore runs the parameter
+# `program`, which consists of operations on the whole matrix. `nhjax.lanes` replaces
+# the operation by its traced implementation, which loops over rows.
 _small_inverse = jax.extend.core.Primitive(SMALL_INVERSE)
 _small_inverse.is_high = never_high
 
@@ -132,8 +132,8 @@ def _by_program(matrix: Array, *, program: Any) -> Array:
 def _inverse_by_rows(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
     """Compute the same as `compiled_once_inverse`, in loops over single rows.
 
-    Its matrices are in memory, so that `nhjax.lanes` could not compile it as a function
-    with numbers as arguments.
+    Its matrices are in memory. Therefore `nhjax.lanes` cannot compile it as a separate
+    function, whose arguments would be single numbers.
     """
     size = matrix.shape[0]
     numbers = jnp.arange(size, dtype=jnp.int32)
@@ -227,8 +227,8 @@ def inverse_by_blocks(matrix: Float[Array, "s n s n"]) -> Float[Array, "s n s n"
     """Invert a matrix of s x s blocks by Gauss-Jordan elimination of blocks.
 
     Rows are exchanged only within a block. The elimination is stable if the diagonal
-    blocks dominate. It is also stable if the matrix is close to a Kronecker product
-    A ⊗ C with n rows in C, and eliminating A without row exchanges is stable. The
+    blocks dominate. It is also stable if the matrix is close to a Kronecker product A ⊗
+    C, where C has n rows and A can be eliminated stably without row exchanges. The
     elimination is a loop over blocks, so that the program is short and the matrix may
     be larger than for `inverse`.
     """
@@ -259,8 +259,8 @@ def solve_by_rows(
     """Solve linear equations by Gaussian elimination with partial pivoting.
 
     All loops go over single rows, so that the program is short and calls no library.
-    This function is slower than a library from about 100 rows on. Like `mapped`, it has
-    no derivative in reverse mode.
+    From about 100 rows on, a library is faster. Like `mapped`, this function has no
+    derivative in reverse mode.
     """
     size = matrix.shape[0]
     numbers = jnp.arange(size, dtype=jnp.int32)

@@ -117,9 +117,9 @@ def iterate(
     iterate, and auxiliary values at x. Increments are measured relative to the size of
     x: `scale`, or the size of the iterate if that is larger, because x may start from
     zero. If both are zero, increments are measured relative to the first increment. If
-    data are larger than x, they add to its round-off: `scale` plus `round_off` then
-    replaces `scale`. `noise` is a measured size: increments always contain errors of
-    about the unit round-off times `noise`.
+    data are larger than x, their round-off adds to the round-off of x: `scale` plus
+    `round_off` then replaces `scale`. `noise` is a measured size: increments always
+    contain errors of about the unit round-off times `noise`.
 
     The iteration ends
 
@@ -127,10 +127,11 @@ def iterate(
     - when small increments have stopped falling, because they are then round-off;
     - when an increment is not finite, or far larger than the first increment and the
         iterate;
-    - after `max_iterations`. If more than 100 are allowed, the iteration has converged
-        if its last increment is at most 32 times the measured noise. Convergence by a
-        factor ρ per iteration leaves an error of increment / (1 - ρ). The noise of all
-        iterations adds up to an error of noise / (1 - ρ), which cannot be avoided.
+    - after `max_iterations`. If more than 100 are allowed, the iteration counts as
+        converged if its last increment is at most 32 times the measured noise.
+        Convergence by a factor ρ per iteration leaves an error of increment / (1 - ρ).
+        The noise of all iterations adds up to an error of noise / (1 - ρ), which cannot
+        be avoided.
 
     The size of round-off depends on the conditioning of the problem, so that a fixed
     threshold would be either too coarse or never met (Hairer, Lubich, Wanner, GNI,

@@ -207,9 +207,9 @@ def _inlined(*operands: Any, jaxpr: Any, kept: _Program) -> list[Any]:
 
 
 # In a program that XLA compiles, functions with fewer operations than this are compiled
-# by XLA too: a call of native code takes longer than the function of a textbook system.
-# The number was measured on the gallery's systems that XLA compiles, mainly with 6 to 8
-# stages.
+# by XLA too: calling native code takes longer than evaluating the function of a
+# textbook system. The number was measured on the gallery's systems that XLA compiles,
+# mainly with 6 to 8 stages.
 _XLA_BELOW = 300
 
 

@@ -460,7 +460,7 @@ def jacobian_by_rows(
 
 
 def _unit_vectors(u: Float[Array, " n"]) -> Float[Array, "n n"]:
-    # `nhjax.lanes` omits products with zeros that pad an array. It must compute
+    # `nhjax.lanes` omits products with zeros that pad an array. It could not omit
     # products with the zeros of `jnp.eye`, because the other factor may be infinite.
     n, one, zero = u.shape[0], jnp.ones((1,), u.dtype), jnp.zeros((), u.dtype)
     rows = [jax.lax.pad(one, zero, [(k, n - 1 - k, 0)]) for k in range(n)]

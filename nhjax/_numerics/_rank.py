@@ -205,7 +205,7 @@ def rank_of_gram(matrix: Float[Array, "l l"]) -> Int[Array, ""]:
 
 
 def reciprocal_condition_of_range(matrix: Float[Array, "l l"]) -> FloatScalar:
-    """Divide the smallest nonzero by the largest eigenvalue of the scaled matrix."""
+    """Compute the smallest nonzero over the largest |eigenvalue|, after scaling."""
     if matrix.shape[0] == 0:
         return jnp.ones((), matrix.dtype)
     values, is_kept = _eigenvalues(matrix)

@@ -273,7 +273,7 @@ def has_flag(model: Any, name: str) -> bool:
 class Unsupported(NamedTuple):
     """A part of a model that nhjax does not support.
 
-    `category` is the word for `ignore`, or None if the part cannot be ignored.
+    `category` is the word in `ignore` that leaves it out, or None if there is none.
     """
 
     category: str | None
@@ -283,7 +283,7 @@ class Unsupported(NamedTuple):
 def check_supported(
     model: Any, ignore: Sequence[str], rolling: Collection[int]
 ) -> dict[str, set[int]]:
-    """Raise a `ValueError` that names the parts neither supported nor ignored.
+    """Raise a `ValueError` for parts that are neither supported nor ignored.
 
     `rolling` has the numbers of the geoms that roll. Return the numbers of the
     actuators and of the equalities to leave out.
@@ -380,8 +380,8 @@ def _joints(model: Any) -> Iterator[Unsupported]:
                 None,
                 f"joint {name!r}: gravity compensation by an actuator with a limit",
             )
-        # Without actuators, MuJoCo omits gravity compensation in the coordinates of
-        # this joint, but not of other joints.
+        # In a model without actuators, MuJoCo omits gravity compensation for this
+        # joint, but not for other joints.
         if model.jnt_actgravcomp[joint] and model.ngravcomp and not model.nu:
             yield Unsupported(
                 None,
@@ -540,7 +540,7 @@ def _rolls(model: Any, pair: tuple[int, int], rolling: Collection[int]) -> bool:
 
 
 def _touching_pairs(model: Any) -> list[tuple[int, int]]:
-    """List the pairs of geoms whose collisions MuJoCo's filters admit."""
+    """List the pairs of geoms that can collide according to MuJoCo's filters."""
     pairs = {
         (min(a, b), max(a, b))
         for a, b in zip(
@@ -563,8 +563,8 @@ def _touching_pairs(model: Any) -> list[tuple[int, int]]:
             is_parent = (
                 weld[one] == parent_of_weld[other] or weld[other] == parent_of_weld[one]
             )
-            # MuJoCo's filter of pairs of parent and child does not apply if the parent
-            # is the world.
+            # This filter excludes pairs of parent and child, except if the parent is
+            # the world.
             if filters_parents and is_parent and weld[one] and weld[other]:
                 continue
             low, high = min(one, other), max(one, other)

@@ -46,11 +46,10 @@ class Robot(eqx.Module):
         name. Add the controls of the actuators as `args["controls"]`, of shape (nu,);
         they are zero by default.
     - `coordinates`: the names of the velocities, in the order of v, which is the order
-        of MuJoCo's `qvel`. A free joint has six and a ball joint three.
+        of MuJoCo's `qvel`. A free joint has six names, a ball joint three.
     - `controls`: the names of the actuators, in the order of the controls.
     - `contacts`: the `nhjax.rolling.Contacts` of the geoms that roll, or None.
-    - `loops`: the names of the equations of closed loops, whose multipliers are the
-        last ones.
+    - `loops`: the names of the equations of closed loops. Their multipliers come last.
     - `bodies`: the names of all bodies.
     """
 
@@ -435,9 +434,9 @@ _FOLDER = Path(__file__).parent / "models"
 
 _LEFT_ROLLERS, _RIGHT_ROLLERS = -math.pi / 4, math.pi / 4
 # The right front wheel of the car may slip sideways, because a steering trapezoid does
-# not turn both front wheels exactly about one centre. On the quadruped, the lateral
-# constraint of a right wheel would repeat the lateral constraint of the left wheel
-# opposite to it when all wheels are parallel.
+# not turn both front wheels exactly about one centre. On the quadruped, when all wheels
+# are parallel, the lateral constraint of a right wheel would repeat the lateral
+# constraint of the opposite left wheel.
 _OPTIONS: Mapping[str, tuple[str, dict[str, Any]]] = MappingProxyType(
     {
         "ackermann_car": (

@@ -19,7 +19,7 @@ Entry: TypeAlias = Any
 Vector: TypeAlias = list[Entry]
 Matrix: TypeAlias = list[Vector]
 
-# A rotation by a right angle has entries of this size in place of zeros.
+# After rounding, a rotation by a right angle has entries of this size instead of zeros.
 _NOISE = 1e-15
 
 

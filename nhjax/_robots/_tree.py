@@ -1,10 +1,10 @@
 """The kinematic tree of a robot: its joints, its configuration space and its poses.
 
 Each joint is a node of the tree. The recursions from the world to the ends of the tree
-treat all nodes at the same depth together, so that the number of operations in the
-program grows with the depth, not with the number of joints: the legs of a robot cost no
-more operations than one leg. Small trees are written in scalars instead, because most
-entries of their frames are zero.
+treat all nodes at the same depth together. The number of operations in the program
+therefore grows with the depth, not with the number of joints: all legs of a robot cost
+no more operations than one leg. Small trees are written in scalars instead, because
+most entries of their frames are zero.
 """
 
 from collections.abc import Sequence
@@ -21,9 +21,9 @@ from . import _scalars as entries
 from ._joints import given_in, Joint, motions, Shift, twists
 
 
-# Trees with more nodes are computed as arrays, whose programs have fewer
-# operations. For smaller trees scalars are better: the program has no products with
-# zeros, and compiles in less time.
+# Trees with more nodes than this are computed as arrays, because the program then has
+# fewer operations. For smaller trees scalars are better: the program has no products
+# with zeros, and compiles in less time.
 LARGEST_OF_SCALARS = 40
 
 

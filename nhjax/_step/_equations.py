@@ -59,8 +59,8 @@ class StageUnknowns(eqx.Module):
         Λ = (start) λ_k + (end) λ_{k+1} + E y, where start, end and E are the constant
         matrices of `method.closure_weights`.
     - `holonomic`: the holonomic multipliers Λ^1..Λ^s.
-    - `end_acceleration`, `end_multiplier`: u̇ and λ_c at the end of the step, which
-        only the symmetric closure has.
+    - `end_acceleration`, `end_multiplier`: u̇ and λ_c at the end of the step; only the
+        symmetric closure has these unknowns.
     - `impulse`: ε, the impulses at both ends of the step along ∂I/∂v of the invariants
         I; None if the run keeps no invariants.
     """
@@ -709,9 +709,9 @@ def stage_residual(
     - `x`: the unknowns, a pytree with the structure of the starting values, which are
         another argument of `solve`.
 
-    **Returns:** the residuals, of shape (k,) with as many entries as `x` has numbers,
-    in the units of momenta and of the constraints; and intermediate values, which
-    `solve` must return in the field `aux` of `Solved`.
+    **Returns:** the residuals, of shape (k,) if `x` has k numbers, in the units of
+    momenta and of the constraints; and intermediate values, which `solve` must return
+    in the field `aux` of `Solved`.
 
     !!! example
 

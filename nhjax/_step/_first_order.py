@@ -26,10 +26,10 @@ from ._equations import StageEquations, StageUnknowns
 JacobianName: TypeAlias = Literal["leading", "first_order", "full"] | None
 
 # The terms make a step faster if the saved iterations cost more time than the terms.
-# This is the case without holonomic constraints, up to these numbers of stages, of
-# coordinates, and of entries of the responses of stages to multipliers. For one
-# trajectory of a larger system, the larger program is no longer compiled to scalar
-# operations, and is several times slower.
+# This is the case if there are no holonomic constraints, and at most this many stages,
+# coordinates, and entries of the responses of stages to multipliers. For one trajectory
+# of a larger system, the larger program is no longer compiled to scalar operations, and
+# is several times slower.
 _MOST_STAGES, _MOST_COORDINATES, _MOST_RESPONSES = 5, 6, 100
 
 
@@ -201,8 +201,8 @@ def first_order_terms(
 ) -> FirstOrderTerms:
     """Compute the terms at the start of the step, in the chart of the stages x."""
     h, c = stages.h, stages.coefficients("c")
-    # The starting value of the first stage is u_k + `first` h u̇, from which the fibre
-    # coordinate u_k at the start of the step follows.
+    # The fibre coordinate u_k at the start of the step follows from the starting value
+    # of the first stage, which is u_k + `first` h u̇.
     first = jnp.sum(stages.coefficients("a_hat"), axis=1)[0]
     u = x.velocity[0] - first * h * lin.acceleration
     inverse = lin.momentum_inverse.as_matrix()
@@ -246,8 +246,8 @@ class _BodySlopes(NamedTuple):
     """Derivatives at the start of a step, in the body frame.
 
     - `inertia_rate`: the rate of N = ∂p/∂u along the motion.
-    - `momentum`: the derivative, with respect to the position, of the momentum at this
-        position minus the initial momentum that the chart transports to this position.
+    - `momentum`: the derivative, with respect to the position, of the momentum at the
+        position minus the initial momentum, transported there by the chart.
     """
 
     inertia_rate: Float[Array, "n n"]

@@ -69,7 +69,7 @@ class Slopes(NamedTuple):
         return total + _times(self.by_xi, jnp.broadcast_to(xi, increment.shape))
 
     def plus(self, factors: Array, other: "Slopes") -> "Slopes":
-        """Add the products of given matrices and other derivatives."""
+        """Add other derivatives, multiplied by given matrices."""
         by_xi = self.by_xi
         if by_xi is not None and other.by_xi is not None:
             by_xi = by_xi + _products(factors, other.by_xi)

@@ -300,7 +300,8 @@ class InvariantCorrection(eqx.Module):
         a = x**2 / (x**2 + eps)
         errors = a / nonzero_or_one(g)
         matrix = errors[:, None] * gram + (1 - a)[:, None] * one
-        # If one function follows from others, the matrix is singular.
+        # If one function follows from others, the matrix is singular without the added
+        # term.
         solved = inverse(matrix + eps**0.5 * one)
         # The gain is the ratio of the impulses to the impulses that a definite matrix,
         # the diagonal matrix of the row sums, would give for the same errors. With one

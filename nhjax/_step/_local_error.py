@@ -45,7 +45,7 @@ from ._step import StepOutcome, StepState
 
 
 # The error of a step is the error of the quadrature with the weights b, times `_GROWTH`
-# to the power p + 1 - s, which is the number of orders that the samples do not
+# to the power p + 1 - s. The exponent is the number of orders that the samples do not
 # determine. The factor a is `_GROWTH_BY_COMMUTATOR` times the eigenvalue of ad(h v).
 # Both values were fitted to the errors of steps of the gallery
 # (`benchmarks.adaptive_steps`).
@@ -131,7 +131,7 @@ def local_error(
 
 
 def _largest(by_force: Array, by_velocity: Array) -> Float[Array, " s"]:
-    """Return the size of each derivative (a row), the larger of two estimates."""
+    """Return the larger of two estimates of the size of each derivative (a row)."""
     both = jnp.stack([by_force, by_velocity])
     return jnp.max(jnp.sqrt(jnp.mean(both**2, axis=2)), axis=0)
 
@@ -180,7 +180,8 @@ def _extrapolated(
     last = sizes[-1]
     growth = _root(last / first, number - 1)
     if number > 2:
-        # A derivative can vanish, but not together with the derivative of next order.
+        # A derivative can vanish, but not together with the derivative of the next
+        # order.
         other = _root(sizes[-2] / first, number - 2)
         growth = jnp.maximum(growth, jnp.minimum(other, known_growth))
         last = jnp.sqrt(last**2 + (growth * sizes[-2]) ** 2)

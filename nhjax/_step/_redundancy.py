@@ -23,12 +23,12 @@ class Redundancy(eqx.Module):
     so that the multipliers keep the least norm, up to the change of the derivatives
     within the step.
 
-    P must not mix nonholonomic and holonomic constraints. Nonholonomic constraints are
-    imposed at the nodes. Holonomic constraints are imposed at the stages, where their
-    rates do not vanish. Therefore P is block diagonal, with the first and the last
-    diagonal block of C C⁻. If a combination of nonholonomic constraints follows from
-    holonomic ones, it is among the remaining equations. At the end of the step both
-    kinds of constraints hold, and so do all equations that follow from them.
+    P must not mix nonholonomic and holonomic constraints: nonholonomic constraints are
+    imposed at the nodes, but holonomic constraints at the stages, where their rates do
+    not vanish. Therefore P is block diagonal, with the first and the last diagonal
+    block of C C⁻. If a combination of nonholonomic constraints follows from holonomic
+    ones, it is among the remaining equations. At the end of the step both kinds of
+    constraints hold, and so do all equations that follow from them.
     """
 
     projector: Float[Array, "l l"]  # P

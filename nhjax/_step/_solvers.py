@@ -69,8 +69,8 @@ _MOST_BEFORE_NEWTON = 100
 def tolerance_array(tolerance: FloatScalarLike) -> FloatScalarLike:
     """Convert the `tolerance` of a solver to an array.
 
-    A number becomes an array of NumPy on the host: the default solver is created when
-    nhjax is imported, and this import must not start JAX's backends or choose a
+    A number becomes a NumPy array on the host, because the default solver is created
+    when nhjax is imported, and this import must not start JAX's backends or choose a
     precision.
     """
     if isinstance(tolerance, int | float) and not isinstance(tolerance, bool):
@@ -126,10 +126,10 @@ class SimplifiedNewton(AbstractStageSolver):
         - `"full"`, the full Jacobian, for machines whose steps need many iterations or
             are not solved.
         - None, the default: the terms of order h are included if they reduce the run
-            time. They do so with s <= 5 stages, n <= 6 coordinates and m constraints,
-            all nonholonomic, with s (s - 1) n m <= 100. The terms are not available for
-            Hamiltonian systems, for redundant constraints, and for so many constraints
-            that their matrices are sparse.
+            time. They do so if all m constraints are nonholonomic, there are s <= 5
+            stages and n <= 6 coordinates, and s (s - 1) n m <= 100. The terms are not
+            available for Hamiltonian systems, for redundant constraints, and for so
+            many constraints that their matrices are sparse.
 
     !!! example
 
@@ -264,7 +264,7 @@ class Newton(AbstractStageSolver):
                 lambda x: stage_residuals(stages, x), x, has_aux=True
             )
             # After a change of x by a few units in the last place, the residuals differ
-            # from the prediction of the Jacobian by their round-off.
+            # from the prediction of the Jacobian by the round-off of the residuals.
             near_z = z + 8 * eps * uneven_perturbations(z)
             near = stage_residuals(stages, unravel(near_z))[0]
             change = stage_residuals(moved, x)[0]
@@ -406,7 +406,7 @@ class Scale(NamedTuple):
     of fibre coordinates. `round_off` and `noise` are values of round-off divided by the
     unit round-off. The round-off of fibre coordinates is about the unit round-off times
     `size + round_off`. Increments below the unit round-off times `noise` count as the
-    round-off of the functions of the system, which is measured.
+    measured round-off of the functions of the system.
     """
 
     size: FloatScalar

@@ -173,7 +173,7 @@ def parameter(value: ArrayLike) -> Array:
     """Convert a parameter to an array, so that changing it does not recompile.
 
     A Python or NumPy scalar becomes a weakly-typed float, so that it takes part in
-    float32 and float64 arithmetic, also with strict dtype promotion.
+    float32 and float64 arithmetic, even with strict dtype promotion.
     """
     if isinstance(value, (int, float, np.number)):
         return jnp.asarray(float(value))
@@ -271,7 +271,7 @@ def check_third_argument(
     system receive p. Holonomic constraints receive neither v nor p. `letter` is "v" or
     "p".
 
-    Nonholonomic constraints and forces only lead to a warning: where the momentum
+    For nonholonomic constraints and forces there is only a warning: where the momentum
     equals the velocity, one function can serve both kinds of systems.
     """
     signature = _signature(function)

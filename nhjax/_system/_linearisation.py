@@ -43,8 +43,8 @@ from ._systems import AbstractMechanicalSystem, check_time_and_state, State
 # With fewer constraints than this, sparse matrices save little. With four constraints
 # in a chain, sparse matrices reduce the time of a step to a third.
 _FEWEST_SPARSE = 4
-# Matrices are sparse only if each block (`SparsityPattern.group` constraints) has at
-# most this fraction of all constraints.
+# Matrices are stored sparse only if each of their blocks, with `SparsityPattern.group`
+# constraints, has at most this fraction of all constraints.
 _LARGEST_BLOCK = 1 / 4
 
 

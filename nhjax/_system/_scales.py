@@ -35,9 +35,9 @@ def violation_scale(
     u: Float[Array, " n"],
     args: Args,
 ) -> Float[Array, " l"]:
-    """Estimate the sizes of the terms of each row of Φ, for any u of the same size.
+    """Estimate how large the terms of each row of Φ are for vectors as large as u.
 
-    The estimate treats Φ as affine in u. It is not the size of the terms at u itself: a
+    The estimate treats Φ as affine in u. The terms at u itself may be too small: a
     constraint such as v[1] has a single term, which is round-off in every state that
     satisfies the constraint. If u is zero, the size of velocities is unknown. It is
     taken as one, since terms that cancel have round-off at rest too.
@@ -61,10 +61,10 @@ def velocity_scale(
 def position_scale(
     system: AbstractMechanicalSystem, t: FloatScalar, q: PyTree[Array], args: Args
 ) -> Float[Array, " k"]:
-    """Estimate the sizes of the terms of each row of Γ, for any q of the same size.
+    """Estimate how large the terms of each row of Γ are for vectors as large as q.
 
-    The estimate treats Γ as affine in q. It is not the size of the terms at q itself;
-    see `violation_scale`. If q is zero, its size is taken as one.
+    The estimate treats Γ as affine in q. The terms at q itself may be too small; see
+    `violation_scale`. If q is zero, its size is taken as one.
     """
     size = nonzero_or_one(max_norm(*jax.tree.leaves(q)))
     sizes = jax.tree.map(lambda x: jnp.full_like(x, size), q)
@@ -83,7 +83,7 @@ def position_terms(
     These terms, times the unit round-off, bound the change of Γ if each entry of q is
     rounded. Entries that Γ does not depend on do not count, although they can be large,
     such as the position of a machine far from the origin. If the linearisation `lin` at
-    q is sparse and of a Lagrangian system, its derivatives of Γ are used.
+    q is sparse and belongs to a Lagrangian system, its derivatives of Γ are used.
     """
     sizes = jax.tree.map(jnp.abs, q)
     if lin.is_sparse and lin.fibre_coordinate_name == "v":

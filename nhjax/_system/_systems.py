@@ -60,7 +60,7 @@ class State(eqx.Module):
 
 
 def check_time_and_state(function: str, t: Any, y: Any, first: str = "") -> None:
-    """Raise unless `y` is a `State` at one time and `t` is not a `State`."""
+    """Raise if `y` is not a `State` at one time, or if `t` is a `State`."""
     advice = f"Call it as `{function}({first}t, y, args)`."
     if isinstance(t, State):
         raise TypeError(f"`t` must be a time, got an nhjax.State. {advice}")
@@ -271,8 +271,8 @@ class AbstractMechanicalSystem(eqx.Module):
         """Compute the user's force F; the system must have a force."""
         given = (multiplier,) if self.force_takes_multipliers else ()
         force = self.call("force", t, q, u, *given, args)
-        # A scalar would act on all coordinates. `initial_state` detects this error only
-        # in the system with which it is called.
+        # A scalar would act on all coordinates. `initial_state` detects this error, but
+        # a run may use another system.
         if jnp.shape(force) != u.shape:
             raise ShapeError(
                 f"`force({', '.join(self.signatures()['force'])})` must return shape "
@@ -425,8 +425,8 @@ class LagrangianSystem(AbstractMechanicalSystem):
     Automatic differentiation computes all derivatives. If a function is an
     `equinox.Module`, its array leaves are parameters of the system, and gradients with
     respect to the system include them. A system can be an argument of `jax.jit`,
-    `jax.vmap` and `jax.grad`: Python functions are a part of its structure, so that
-    another function needs a new compilation.
+    `jax.vmap` and `jax.grad`. Python functions are a part of its structure: a system
+    with another function is compiled again.
 
     Values that the functions read besides their arguments (globals, variables of
     enclosing functions, attributes of objects) are compiled in. `integrate` and
@@ -451,11 +451,11 @@ class LagrangianSystem(AbstractMechanicalSystem):
         with respect to the multipliers, and the constraints must be independent.
     - `manifold`: the configuration manifold; by default R^n with the n of the state.
     - `constraints`: `"independent"` refuses dependent constraints. `"redundant"` allows
-        constraints that follow from others, also nonholonomic constraints that follow
-        from holonomic ones. Different multipliers then give the same reaction. nhjax
-        chooses the multipliers with the least Σ |λ_a B_a|², where |λ_a B_a| is the size
-        of the reaction of one constraint in the metric M⁻¹. The multiplier of a
-        nonholonomic constraint is zero if the constraint follows from holonomic
+        constraints that follow from others, including nonholonomic constraints that
+        follow from holonomic ones. Different multipliers then give the same reaction.
+        nhjax chooses the multipliers with the least Σ |λ_a B_a|², where |λ_a B_a| is
+        the size of the reaction of one constraint in the metric M⁻¹. The multiplier of
+        a nonholonomic constraint is zero if the constraint follows from holonomic
         constraints. `nhjax.Motion.is_unique` says which multipliers the equations
         determine. `docs/systems.md` has the details.
     - `coordinates`: a tuple of the names of the n coordinates, for
@@ -704,7 +704,7 @@ def with_kept_functions(
     """Return the system with functions that are traced and differentiated once.
 
     The arrays that the functions read become leaves of the system, because the
-    derivative rules of a step reach only the leaves of its arguments.
+    derivative rules of a step cover only the leaves of its arguments.
     """
     multiplier = None
     if system.force_takes_multipliers:

@@ -2,10 +2,10 @@
 
 The key of a program is a hash of everything that its code depends on: the jaxpr with
 its constants, the options of compilation, the machine, and the versions of this
-compiler, of LLVM, of JAX and of NumPy. The key is computed without the graph of the
-program, which takes much less time than compilation. If a parameter of an operation has
-a type that is not known here, such as a Python function, the program gets no key, and
-is compiled in each process.
+compiler, of LLVM, of JAX and of NumPy. The graph of the program is not needed for the
+key, so that computing the key takes much less time than compilation. If a parameter of
+an operation has a type that is not known here, such as a Python function, the program
+gets no key, and is compiled in each process.
 
 The cache follows JAX's options for its persistent compilation cache. It is a folder in
 JAX's directory, with one file for each program. A file contains the key, a checksum and

@@ -460,8 +460,8 @@ def _over_rows(
     """Create a loop over rows, which carries some arrays and stacks other results.
 
     `of_carry` says which of the carried arrays are in memory, and `avals` are the types
-    of the stacked results. `order` is the number of rows, and whether the loop begins
-    with the last row.
+    of the stacked results. `order` has two entries: the number of rows, and whether the
+    loop begins with the last row.
     """
     graph, memory, count = builder.graph, builder.memory, len(carry)
     length, reverse = order

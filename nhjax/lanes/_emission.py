@@ -70,7 +70,7 @@ def emit(
         mark_broadcast(live)
     else:
         for buffer in live.buffers:
-            # The address of a batched operand depends on the member also at width 1.
+            # Even at width 1, the address of a batched operand depends on the member.
             buffer.is_divergent = buffer.kind == "operand" and is_batched[buffer.place]
     writer = Writer(width, contract)
     writer.lines.extend(_members(width))
@@ -367,10 +367,9 @@ class _Functions:
         dtypes = [function.outs[index].dtype for index in self._used[function]]
         floats = [x for x in dtypes if is_float(x)]
         if width == 1 and len(floats) in (3, 4):
-            # On x86-64 LLVM returns a third and a fourth float in registers of the x87
-            # unit. Without optimisation, the instructions that it writes for
-            # this do not exist. It returns five floats in memory, so unused floats are
-            # added to get five.
+            # On x86-64 LLVM returns a third and a fourth float in x87 registers, for
+            # which it writes invalid instructions if optimisation is off. It returns
+            # five floats in memory, so unused floats are added to get five.
             dtypes += floats[: 5 - len(floats)]
         return result_type([vector(scalar_type(x), width) for x in dtypes])
 

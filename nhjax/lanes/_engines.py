@@ -5,7 +5,7 @@ ns, as long as arithmetic with tens of numbers. One iteration of a stage solver 
 of about fifty such kernels. If a called computation is marked as small, XLA compiles it
 to a single kernel, including its loops. On the gallery's systems this is three to five
 times faster than a sequence of kernels. The mark is internal to XLA, and its meaning
-may change. The results are the same without the mark, which only the CPU uses.
+may change. Only the CPU uses the mark; without it, the results are the same.
 """
 
 import os
@@ -197,9 +197,9 @@ def by_one_kernel(ctx, *operands, program, options):
 def _tied(operands: tuple[Any, ...]) -> list[Any]:
     """Return the same operands, in a form that XLA cannot recognise as unused.
 
-    XLA aborts if a parameter of a marked call is unused, even if it is unused only
-    after XLA's own simplifications. For this reason every small operand is made to
-    depend on all operands, in a way that never changes its value.
+    XLA aborts if a parameter of a marked call is unused, even if it becomes unused only
+    by XLA's own simplifications. For this reason every small operand is made to depend
+    on all operands, in a way that never changes its value.
     """
     firsts = [x.reshape(-1)[0] for x in operands]
     signs = [(x != jnp.zeros_like(x)).astype(jnp.int32) for x in firsts]

@@ -377,7 +377,7 @@ def _singular_values(a: Any, **_: Any) -> list[Any]:
 
     def goes_on(carry: Any) -> Any:
         number, _, cosines = carry
-        # The rounding errors of products of rows do not let the cosines become zero.
+        # Because of rounding errors, the cosines do not become exactly zero.
         return (number < _MOST_SWEEPS) & (cosines > width * eps)
 
     start = jnp.int32(0), rows, jnp.ones_like(largest)

@@ -12,7 +12,7 @@ was created, because the program may take the other side.
 
 `Graph.op` folds constants and removes operations, but never changes a result: rounding,
 infinities, NaN and -0.0 are unchanged. The exception is a structural zero, such as a
-zero from padding: its product with any number is zero, also with infinity and NaN.
+zero from padding: its product with any number is zero, even with infinity and NaN.
 
 The order of this file: the data (regions, nodes, memory), `Graph`, the rules of
 simplification, the builders of loops and branches, and functions: programs that are
@@ -733,7 +733,7 @@ class Function:
 
     @property
     def is_shared(self) -> bool:
-        """Whether the function is long, and computes with numbers only."""
+        """Whether the function is long, and computes only with numbers."""
         is_pure = all(node.op not in _STATEMENTS for node in self.nodes)
         return is_pure and len(self.nodes) >= _SHORTEST
 

@@ -80,9 +80,9 @@ def _div(writer: Writer, node: Node, width: int, args: list[str]) -> str:
 
 
 def _integer_division(writer: Writer, node: Node, width: int, args: list[str]) -> str:
-    """Divide integers; the results are XLA's also for divisors that may trap in LLVM.
+    """Divide integers with the results of XLA, also where LLVM's division may trap.
 
-    The divisor 0 may trap, and so may -1 if the quotient overflows.
+    LLVM may trap for the divisor 0, and for -1 if the quotient overflows.
     """
     a, b = args
     divisor, signed = node.args[1], is_signed(node.dtype)
@@ -240,8 +240,8 @@ _SHIFTS = {
 def _shift(writer: Writer, node: Node, width: int, args: list[str]) -> str:
     """Shift integers as XLA does.
 
-    A shift by the number of bits or more gives zero, or only sign bits if it is an
-    arithmetic shift to the right.
+    A shift by at least the number of bits gives zero, except that an arithmetic shift
+    to the right gives only sign bits.
     """
     kind, flag = vector(scalar_type(node.dtype), width), vector("i1", width)
     size, op = bits(node.dtype), _SHIFTS[node.op]

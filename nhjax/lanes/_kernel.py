@@ -31,9 +31,9 @@ class CompileOptions(NamedTuple):
         is compiled in less time, to slower code.
     - `engines`: the engines that may compile the program and its derivatives, in the
         order in which they are tried.
-    - `xla_below`: inside a program that XLA compiles, XLA also compiles programs with
-        fewer operations than this, because a call of native code from a program of XLA
-        takes longer than a few operations.
+    - `xla_below`: if XLA compiles the surrounding program, it also compiles programs
+        with fewer operations than this, because a call of native code would take longer
+        than these few operations.
     - `note`: text that the function `engines` adds to the reason.
     """
 
@@ -66,7 +66,7 @@ def captures_tracers(program: Any) -> bool:
 
 
 def never_high(*_: Any, **__: Any) -> bool:
-    """Tell JAX not to expand operations inside a program before it is lowered.
+    """Tell JAX not to expand the operations of a program before lowering it.
 
     Since JAX 0.12, some operations ("high" primitives) are expanded to simpler
     operations. A primitive whose program contains high primitives would need a rule

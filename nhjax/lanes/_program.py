@@ -5,8 +5,8 @@ write its kernel (`llvm_ir`), compile the kernel together with a handler, and re
 the handler with XLA under a name (`register_kernel`).
 
 The name is a hash of the kernel, the machine, the version of the compiler and the level
-of optimisation, so that equal programs have equal names in all processes and are
-compiled once in a process. A name stays registered with XLA as long as the process
+of optimisation. Equal programs therefore have equal names in all processes, and are
+compiled once in each process. A name stays registered with XLA as long as the process
 runs, and an executable may call the handler at any time. Code is therefore never freed:
 a program takes 20 to 150 KB, and `compiled_code` returns the total.
 
@@ -383,7 +383,7 @@ def _name(*texts: str) -> str:
 # This compiler turns all arrays into scalars. Measurements on the gallery's systems
 # with 2 to 8 stages, and on larger systems, show that its code is faster than XLA's if
 # the root mean square of array sizes is at most `_SMALL_ARRAYS`. For larger arrays XLA
-# is often faster, since it uses vectors for operations on arrays also in a single run.
+# is often faster, since it uses vectors for operations on arrays even in a single run.
 # But XLA takes more than 1 ms to compile an operation. Therefore, up to `_LARGE_ARRAYS`
 # XLA compiles only short programs. Above this size it compiles all programs.
 _SMALL_ARRAYS, _LARGE_ARRAYS = 40, 110

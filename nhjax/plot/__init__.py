@@ -1,8 +1,9 @@
 """Figures of trajectories and of convergence, and animations, drawn with matplotlib.
 
 Every drawing function draws into the axes `ax` if they are given. Otherwise it creates
-a figure in the light form of `style`. The function returns the axes or the animation,
-and never shows or saves them. The first call that needs matplotlib imports it.
+a figure in the light style (see `style`). The function returns the axes or the
+animation, and never shows or saves them. The first call that needs matplotlib imports
+it.
 """
 
 from ._animation import animate as animate

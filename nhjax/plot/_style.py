@@ -39,8 +39,8 @@ def style(*, dark: bool = False) -> contextlib.ExitStack:
     end of the block.
 
     Without a call of `style`, the functions of `nhjax.plot` use the light style for the
-    figures that they create. If a setting differs from matplotlib's default, they do
-    not change it, because you have set it, for instance by `style(dark=True)`.
+    figures that they create. They do not change a setting that differs from
+    matplotlib's default: you have set it, for instance by `style(dark=True)`.
 
     **Arguments:**
 
@@ -85,7 +85,7 @@ def styled(draw: Callable[P, R]) -> Callable[P, R]:
 
 
 def grey(level: float) -> str:
-    """Return a grey between the colour of text (level 0) and of the background (1)."""
+    """Return a grey between the colours of text (level 0) and background (level 1)."""
     from matplotlib import colors, rcParams
 
     light = sum(colors.to_rgb(rcParams["text.color"])) > 1.5

@@ -25,7 +25,7 @@ QUICK: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     }
 )
 # For each study: the seconds to compile a program, the seconds per step of a trajectory
-# (both measured on two cores of 2 GHz), and whether the study compiles a program for
+# (both measured on two cores of 2 GHz), and whether the study compiles one program for
 # each pair (s, h). Otherwise it compiles one program for each s.
 _COSTS: Mapping[str, tuple[float, float, bool]] = MappingProxyType(
     {

@@ -247,9 +247,9 @@ def ball_invariants(
 ) -> BallInvariants:
     """Compute the first integrals of the homogeneous ball on a turntable.
 
-    This is the fifth experiment of the paper. For one step size, Lobatto-3 and the
+    This is the fifth experiment of the paper. For one step size, three stages and the
     Cayley map, the paper plots the errors of the four first integrals against time.
-    Three of the integrals are linear and are conserved to the tolerance of the
+    Three of the integrals are linear. They are conserved to the tolerance of the
     nonlinear solver, which is 1e-12 in the paper and round-off here. The error of the
     fourth integral, the moving energy, oscillates like the energy error of a holonomic
     system. In addition, this study measures whether the error of the moving energy

@@ -42,9 +42,9 @@ if TYPE_CHECKING:
 
 
 TIMES = (10.0, 50.0, 100.0, 200.0)
-# The mean squared energy error μ(E, k) is averaged over an interval of this length on
-# each side of a time, because the value of μ at one step fluctuates with the fast
-# motion of the system.
+# The mean squared energy error μ(E, k) is averaged over an interval that extends this
+# far on each side of a time, because the value of μ at one step fluctuates with the
+# fast motion of the system.
 WINDOW = 5.0
 # The largest number of members that run at a time, and the largest number of bytes of
 # their saved energies, so that memory does not grow with the number of members.
@@ -217,11 +217,12 @@ def chaotic_energy(
     """Compute the mean squared energy error of an ensemble of the chaotic system.
 
     This is the third experiment of the paper: J + 1 motions of a system with 7
-    coordinates on one energy surface. E_jk is the energy of member j at step k. The
-    mean of (E_jk - E_0)² over the ensemble, μ(E, k), scales as h^{4(s-1)}. Every motion
-    is chaotic, so that only statistics of the ensemble can be compared, and not single
-    motions. Members run in chunks and statistics are updated after each chunk, so that
-    memory does not grow with J. The error bar of μ is its standard error.
+    coordinates, all with the same initial energy E_0. Let E_jk be the energy of member
+    j at step k. The mean of (E_jk - E_0)² over the ensemble, μ(E, k), scales as
+    h^{4(s-1)}. Every motion is chaotic, so that only statistics of the ensemble can be
+    compared, not single motions. Members run in chunks, and statistics are updated
+    after each chunk, so that memory does not grow with J. The error bar of μ is its
+    standard error.
 
     **Arguments:**
 

@@ -64,7 +64,7 @@ class Appell(AbstractConstrainedExample):
         }
 
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Compute (q, v, λ) at `t`, for consistent data as long as ż keeps its sign."""
+        """Compute (q, v, λ) at `t` for consistent data, as long as ż keeps its sign."""
         q0, v0 = self._consistent_data()
         require_nonzero("v0[2]", v0[2], "the constraint is singular there")
         weight = float(self.mass) * float(self.gravity)

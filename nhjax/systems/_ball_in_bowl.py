@@ -32,13 +32,13 @@ class BallInBowl(AbstractConstrainedGroupExample):
     φ = (ẋ - a (R ω) × n - Ω e₃ × (x - a n))₁₂,  n = ∇Φ/|∇Φ|,
 
     on SO(3) x R³, with q = (R, (x, y, z)): the attitude quaternion and the position of
-    the centre of the ball [m], which is the vector x in φ; v = (ω₁, ω₂, ω₃, ẋ, ẏ, ż)
-    with the body angular velocity ω [1/s]. The centre moves on Φ = 0, a paraboloid
-    (ε = 0) or a sphere of radius 1/κ (ε = 1) with its lowest point at the origin. The
-    bowl is the parallel surface at the distance a below, and n is the normal of both
-    surfaces. The constraints φ, which are affine, mean that the ball does not slip at
-    the contact x - a n. With the multipliers (λ₁, λ₂, μ) the force of the bowl is
-    (λ₁, λ₂, 0) + μ ∇Φ [N].
+    the centre of the ball [m]. This position is the vector x in φ. The velocity is
+    v = (ω₁, ω₂, ω₃, ẋ, ẏ, ż), with the body angular velocity ω [1/s]. The centre moves
+    on Φ = 0. This surface is a paraboloid (ε = 0) or a sphere of radius 1/κ (ε = 1),
+    with its lowest point at the origin. The bowl is parallel to this surface, at the
+    distance a below it; n is the normal of both. The constraints φ are affine. They
+    mean that the ball does not slip at the contact x - a n. With the multipliers
+    (λ₁, λ₂, μ) the force of the bowl is (λ₁, λ₂, 0) + μ ∇Φ [N].
 
     The energy E is not conserved, but the moving energy
     E - Ω (m (x ẏ - y ẋ) + k m a² (R ω)₃) is conserved. For a flat bowl, κ = 0, the
@@ -128,7 +128,7 @@ class BallInBowl(AbstractConstrainedGroupExample):
 
         `velocity` (ẋ, ẏ) is the velocity of the centre. `spin` is the component of the
         angular velocity along the normal n. `parameters` are the parameters of the
-        class. In a sphere the ball is in the lower half.
+        class. In a sphere the ball is placed in the lower half.
         """
         ball = cls(**parameters)
         x, y = coordinates(position)
@@ -244,7 +244,7 @@ class Bowl(eqx.Module):
     shape: Shape = eqx.field(static=True)
 
     def value(self, x: Vector3) -> Array:
-        """Compute at a point the function Φ, which is zero on the surface."""
+        """Compute the function Φ at a point; Φ is zero on the surface."""
         round_part = x if self.shape == "sphere" else x[:2]
         return x[2] - 0.5 * self.curvature * (round_part @ round_part)
 

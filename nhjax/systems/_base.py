@@ -123,8 +123,8 @@ def integral(
 ) -> np.ndarray:
     """Integrate a function of time over [0, t] to round-off.
 
-    `integrand` maps an array of times to values whose last axes are the axes of this
-    array; `rate` is the inverse of the shortest time scale on which the values vary.
+    `integrand` maps an array of times to values whose last axes are the axes of the
+    times; `rate` is the inverse of the shortest time scale on which the values vary.
     """
     panels = math.ceil(abs(t) * rate) + 1
     edges = np.linspace(0.0, t, panels + 1)

@@ -26,11 +26,11 @@ class CarWithTrailers(AbstractNonholonomicExample):
 
     L = Σ (m_i/2 |ċ_i|² + I_i/2 θ̇_i²) + J/2 (θ̇₀ + δ̇)²,
 
-    summed over the car (i = 0) and its trailers, with the centres of mass c_i and
-    q = (x, y, θ₀, δ, θ₁ ... θₙ): the middle of the rear axle [m], the heading of the
-    car, the steer angle of the front wheels relative to the car, and the headings of
-    the trailers [rad]. The wheels do not slip sideways. With the unit vectors e(θ)
-    along a heading θ and n(θ) to its left, the constraints are
+    summed over the car (i = 0) and its trailers, with the centres of mass c_i. The
+    coordinates are q = (x, y, θ₀, δ, θ₁ ... θₙ): the middle of the rear axle [m], the
+    heading of the car, the steer angle of the front wheels relative to the car, and the
+    headings of the trailers [rad]. The wheels do not slip sideways. With the unit
+    vectors e(θ) along a heading θ and n(θ) to its left, the constraints are
 
     Φ = (n(θ₀)·ṙ₀, n(θ₀ + δ)·ṙ_front, n(θ₁)·ṙ₁ ... n(θₙ)·ṙₙ)
 
@@ -38,7 +38,7 @@ class CarWithTrailers(AbstractNonholonomicExample):
     L, and the axles r_i = r_{i-1} - h_i e(θ_{i-1}) - d_i e(θ_i) of the trailers. The
     multipliers are the forces of the ground on the axles, to the left of the wheels.
 
-    `args` is None or a pair of the force that drives the car at the rear axle [N] and
+    `args` is None or a pair: the force that drives the car at the rear axle [N] and
     the torque that steers the front wheels [N m]. Without the torque, the momentum
     J (θ̇₀ + δ̇) is conserved. Without the force and the torque, the energy is conserved
     too. `turning` creates a car that turns steadily.
@@ -153,9 +153,9 @@ class CarWithTrailers(AbstractNonholonomicExample):
     ) -> Array:
         """Compute the v that satisfies the constraints, given the rear axle's speed.
 
-        A trailer turns at the rate (v sin β - h θ̇ cos β)/d and has the speed
-        v cos β + h θ̇ sin β, where v and θ̇ are the speed and the turning rate of the
-        vehicle in front, and β is the angle between the two vehicles.
+        Let v and θ̇ be the speed and the turning rate of the vehicle in front of a
+        trailer, and β the angle between the two. The trailer turns at the rate
+        (v sin β - h θ̇ cos β)/d, and has the speed v cos β + h θ̇ sin β.
         """
         along, steering = (jnp.asarray(x, q.dtype) for x in (speed, steer_rate))
         heading, steer = q[2], q[3]
@@ -192,7 +192,7 @@ class CarWithTrailers(AbstractNonholonomicExample):
         return jnp.stack(slips)
 
     def force(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Compute the generalised force of `args`, the driving force and the torque."""
+        """Compute the generalised force of the drive and the torque in `args`."""
         what = "the driving force and the torque on the steering"
         drive, torque = given_forces(args, (2,), v.dtype, what)
         force = jnp.zeros_like(v)

@@ -17,17 +17,17 @@ class ChaplyginSphere(AbstractRollingBody):
     φ = (R (v - r ω × γ))₁₂,  γ = Rᵀ e₃,
 
     with q = (R, x): the attitude quaternion and the position of the centre, which
-    is also the centre of mass [m]; (v, ω) are their body velocities along the principal
-    axes [m/s, 1/s]. Φ is the height of the contact, and φ the horizontal velocity
-    there. The multipliers are the components, along the axes of space, of the force
-    that the plane exerts on the sphere [N].
+    is also the centre of mass [m]; v and ω are the linear and angular velocity along
+    the principal axes [m/s, 1/s]. Φ is the height of the contact, and φ the horizontal
+    velocity there. The multipliers are the components, along the axes of space, of the
+    force that the plane exerts on the sphere [N].
 
     The angular momentum about the contact, R K with K = I ω + m r² (ω - (ω·γ) γ), is
     constant in space, so that |K|² and K·γ are constant too, and the system is
     integrable.
 
     **Parameters:** `mass` m [kg]; `radius` r [m]; `moments` (I₁, I₂, I₃) about the
-    centre [kg m²]; `gravity` g [m/s²], which only presses the sphere on the plane;
+    centre [kg m²]; `gravity` g [m/s²], which affects only the normal force;
     `retraction`, the retraction of SE(3).
 
     **Source:** Chaplygin, *On a ball's rolling on a horizontal plane* (1903), in
@@ -82,7 +82,7 @@ class ChaplyginSphere(AbstractRollingBody):
         return -self.radius * up
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Compute the energy and R K, the contact momentum in space: both conserved."""
+        """Compute the conserved energy, and the conserved contact momentum R K."""
         x, y, z = SO3().Ad(q[:4], self.contact_momentum(q, v))
         return {
             "energy": self.energy(t, q, v),

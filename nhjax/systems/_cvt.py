@@ -17,9 +17,9 @@ class ContinuouslyVariableTransmission(AbstractConstrainedExample):
     L = ½ (ẋ² + ẏ² + ż²) - ½ (x² + z² - 2 cos y + ε sin 2y),
     Φ = ż + sin(y) ẋ,  q = (x, y, z), in dimensionless units.
 
-    The passenger (x, z) does not act on the driver y, which is a pendulum. Their
-    energies E_d = ½ ẏ² - cos y + ½ ε sin 2y and E_p = ½ (ẋ² + ż² + x² + z²) are
-    conserved separately.
+    The driver y is a pendulum, on which the passenger (x, z) does not act. The energy
+    of the driver, E_d = ½ ẏ² - cos y + ½ ε sin 2y, and the energy of the passenger,
+    E_p = ½ (ẋ² + ż² + x² + z²), are conserved separately.
 
     **Parameters:** `epsilon` ε >= 0, the perturbation of the pendulum [1]. The class
     methods `low` and `high` create the system with the two sets of initial data of the
@@ -84,7 +84,7 @@ class ContinuouslyVariableTransmission(AbstractConstrainedExample):
         }
 
     def exact_driver(self, t: float) -> tuple[float, float]:
-        """Compute (y, ẏ) at `t` for ε = 0, except at the upright equilibrium.
+        """Compute (y, ẏ) at `t` for ε = 0, unless the pendulum rests upright.
 
         Let k² = (1 + E_d)/2. If the pendulum oscillates (k < 1), the solution is
         sin(y/2) = k sn(t + t0 | k²); if it rotates, y/2 = ±am(k(t + t0) | 1/k²).

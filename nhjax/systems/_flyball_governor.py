@@ -180,7 +180,7 @@ class FlyballGovernor(AbstractExample):
         return driving + resisting
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Compute the vertical angular momentum, and the energy with rigid couplers."""
+        """Compute the vertical angular momentum and, with rigid rods, the energy."""
         momentum = jax.grad(self.lagrangian, argnums=2)(t, q, v, None)
         conserved = {"vertical_momentum": momentum[0]}
         if self.couplers == "springs":

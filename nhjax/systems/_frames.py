@@ -16,7 +16,7 @@ class Frame(NamedTuple):
     origin: Float[Array, "3"]
 
     def move(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Compute the place of a point of the body, or its velocity from a rate."""
+        """Compute the place of a body point, or its velocity if the frame is a rate."""
         return self.origin + self.rotation @ point
 
 

@@ -112,11 +112,11 @@ class HeavyTopSE3(AbstractExample):
 
     ℓ = m/2 |v|² + ½ (J₁ω₁² + J₂ω₂² + J₃ω₃²) - m g e₃·x,  Φ = x - R X,
 
-    with q = (R, x): the attitude quaternion and the position of the centre of mass;
-    (v, ω) are their body velocities, and X is the centre of mass in the body, seen from
-    the pivot. The three constraints are holonomic, and their multipliers are the
-    components of the force of the pivot in space. The body moves like `HeavyTop` with
-    the same parameters.
+    with q = (R, x): the attitude quaternion and the position of the centre of mass; v
+    and ω are the linear and angular velocity in body axes. X is the centre of mass in
+    the body, seen from the pivot. The three constraints are holonomic, and their
+    multipliers are the components of the force of the pivot in space. The body moves
+    like `HeavyTop` with the same parameters.
 
     **Parameters:** the parameters of `HeavyTop`; `retraction`, the retraction of SE(3).
 

@@ -22,9 +22,9 @@ class NonholonomicParticle(AbstractConstrainedExample):
 
     L = m/2 (ẋ² + ẏ² + ż²) - k/2 (x² + y²),  Φ = ż - y ẋ,  q = (x, y, z).
 
-    The coordinate y, the driver, is a harmonic oscillator that x and z, the passenger,
-    do not influence. In the rescaled time s with ds = ν dt/√(1 + y²), ν² = k/m, the
-    coordinate x is a harmonic oscillator, too.
+    The coordinate y (the driver) is a harmonic oscillator, which x and z (the
+    passenger) do not influence. In the rescaled time s with ds = ν dt/√(1 + y²) and
+    ν² = k/m, the coordinate x is a harmonic oscillator, too.
 
     **Parameters:** `mass` m [kg], `stiffness` k [N/m]; lengths are in metres, and the
     factor y in Φ stands for y times 1 m⁻¹.

@@ -27,13 +27,14 @@ class Rattleback(AbstractRollingBody):
     s = h e₃ - A γ / √(γ·(A γ)),  A = diag(a², b², c²),  γ = Rᵀ e₃,
 
     with q = (R, x): the attitude quaternion and the position of the centre of mass
-    [m]; (v, ω) are their body velocities [m/s, 1/s]. The body axes are the axes of the
-    ellipsoid; at rest, the third axis points upward. The lowest point is s, seen from
-    the centre of mass. Φ is its height, and φ the horizontal velocity at the contact.
-    The multipliers are the components, along the axes of space, of the force that the
-    plane exerts on the body [N]. The third axis is a principal axis of inertia, but the
-    other two axes are not. Therefore a spin in one sense turns into rocking, and the
-    rocking into a spin in the other sense.
+    [m]; v and ω are the linear and angular velocity in body axes [m/s, 1/s]. The body
+    axes are the axes of the ellipsoid; at rest, the third axis points upward. The
+    vector from the centre of mass to the lowest point is s. Φ is the height of this
+    point, and φ the horizontal velocity there. The multipliers are the components,
+    along the axes of space, of the force that the plane exerts on the body [N]. The
+    third axis is a principal axis of inertia, but the other two axes are not. Therefore
+    a spin in one sense turns into rocking, and the rocking into a spin in the other
+    sense.
 
     With `damping` σ the air exerts the torque -σω, and energy is not conserved.
 

@@ -32,8 +32,8 @@ class RodSleigh(AbstractNonholonomicExample):
     other angles n is not orthogonal to the rod, so that the reactions of the two
     constraints are coupled.
 
-    If the blade is shifted along n, the body can still have the same velocities.
-    Therefore the body moves like a `ChaplyginSleigh` whose blade is at the foot of the
+    A shift of the blade along n does not change the velocities that Φ allows. Therefore
+    the body moves like a `ChaplyginSleigh` whose blade is at the foot of the
     perpendicular from the centre of mass to the line through the contact along n.
 
     **Parameters:** `mass1` m₁ and `mass2` m₂ [kg], `length` l [m], `angle` β [rad].
@@ -135,8 +135,8 @@ class RodSleigh(AbstractNonholonomicExample):
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute (q, v, λ) at `t`, for consistent data, a turning rod and cos β != 0.
 
-        λ has the nonholonomic multiplier first, then the holonomic multiplier. Both,
-        and the motion, are computed from the exact solution of `equivalent_sleigh`.
+        λ has the nonholonomic multiplier first, then the holonomic multiplier. Motion
+        and multipliers are computed from the exact solution of `equivalent_sleigh`.
         """
         self._consistent_data()
         tangency = jax.jvp(

@@ -29,9 +29,9 @@ class RollerRacer(AbstractGaitMachine):
 
     with q = (x, y, θ, φ): the position r₁ = (x, y) [m] of the axle of the seat, the
     heading θ [rad] of the seat, and the angle φ [rad] of the handlebar relative to the
-    seat; e(α) is the unit vector at the angle α, and n₁, n₂ are the unit vectors across
+    seat. The unit vector at the angle α is e(α); n₁ and n₂ are the unit vectors across
     the two bodies. The centres of mass lie at the axles, d₁ behind and d₂ ahead of the
-    pivot. Where d₁ cos φ + d₂ = 0 the constraints do not determine the turning rate.
+    pivot. If d₁ cos φ + d₂ = 0, the constraints do not determine the turning rate.
 
     A `gait` prescribes φ by the holonomic constraint Γ = φ - gait(t). With `gait=None`
     the pivot moves freely under the torque [N m] in `args`, a scalar or `None`. The

@@ -26,10 +26,10 @@ class AbstractRollingBody(AbstractConstrainedGroupExample):
     ℓ = m/2 |v|² + ½ ω·(J ω) - m g z,  Φ = z + e₃·(R s),  φ = (R (v + ω × s))₁₂,
 
     with q = (R, x): the attitude quaternion and the position of the centre of mass
-    [m]; (v, ω) are their body velocities [m/s, 1/s]. The lowest point of the body is s,
-    seen from the centre of mass in body axes: Φ is its height, and φ the horizontal
-    velocity of the material point at s. The multipliers are the force of the plane in
-    space: its two horizontal components, and its normal component [N].
+    [m]; v and ω are the linear and angular velocity in body axes [m/s, 1/s]. The vector
+    from the centre of mass to the lowest point is s, in body axes. Φ is the height of
+    this point, and φ the horizontal velocity of the body there. The multipliers are the
+    two horizontal components and the normal component of the force of the plane [N].
     """
 
     mass: eqx.AbstractVar[Array]

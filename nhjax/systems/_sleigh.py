@@ -75,8 +75,8 @@ class ChaplyginSleigh(AbstractConstrainedExample):
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute (q, v, λ) at `t`, for consistent data with θ̇ != 0 and `offset` != 0.
 
-        u = √(2E/m) tanh τ and θ̇ = ±√(2E/I) sech τ with τ = κt + c; the heading is an
-        elementary function and (x, y) a quadrature.
+        u = √(2E/m) tanh τ and θ̇ = ±√(2E/I) sech τ with τ = κt + c. The heading is an
+        elementary function of time, and (x, y) is an integral over time.
         """
         (x0, y0, heading0), (dx0, dy0, omega0) = self._consistent_data()
         m, a = float(self.mass), float(self.offset)
@@ -116,6 +116,6 @@ def _gudermannian(x):
 
 
 def _sech(x):
-    # 1/cosh tends to zero in a long motion, but cosh overflows.
+    # In a long motion cosh would overflow, although 1/cosh only tends to zero.
     decay = np.exp(-np.abs(x))
     return 2 * decay / (1 + decay**2)

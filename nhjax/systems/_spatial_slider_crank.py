@@ -29,12 +29,12 @@ class SpatialSliderCrank(AbstractExample):
     Φ = s - l e(α, β) - p(θ),  e = (cos β, sin α sin β, -cos α sin β),
     p = (0, y₀ - r sin θ, z₀ + r cos θ),  s = (x, 0, 0),
 
-    with q = (θ, α, β, x): the angle of the crank about its axle, which is parallel to
-    the x-axis, the two angles of the universal joint at the slider [rad], and the place
-    of the slider [m]. The rod has the angular velocity ω = (α̇ cos β, β̇, α̇ sin β) in
-    its own axes, of which the first is e. The rod ends in a spherical joint at the pin
-    p of the crank. The centre of the rod is c, and J = I_c + m_c r²/4 is the moment of
-    inertia of the crank about its axle.
+    with q = (θ, α, β, x): the angle of the crank about its axle, the two angles of the
+    universal joint at the slider [rad], and the place of the slider [m]. The axle is
+    parallel to the x-axis. The rod has the angular velocity
+    ω = (α̇ cos β, β̇, α̇ sin β) in its own axes, of which the first is e. The rod ends
+    in a spherical joint at the pin p of the crank. The centre of the rod is c, and
+    J = I_c + m_c r²/4 is the moment of inertia of the crank about its axle.
 
     **Parameters:** `crank_length` r, `rod_length` l, `axle` (y₀, z₀) [m]; `crank_mass`
     m_c, `rod_mass` m_r, `slider_mass` m_s [kg]; `crank_inertia` I_c about the middle of

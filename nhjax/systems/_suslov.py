@@ -57,7 +57,7 @@ class Suslov(AbstractConstrainedGroupExample):
         require_shape((3,), moments=self.moments)
         require_shape((2,), products=self.products)
         require_positive(moments=self.moments)
-        # The determinant of the inertia matrix, over I₁₁ I₂₂.
+        # The determinant of the inertia matrix, divided by I₁₁ I₂₂.
         determinant = self.moments[2] - jnp.sum(self.products**2 / self.moments[:2])
         require_possible(
             determinant > 0,

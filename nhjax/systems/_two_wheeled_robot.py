@@ -36,8 +36,8 @@ class TwoWheeledRobot(AbstractNonholonomicExample):
     wheels together, and the forward forces on the right and on the left wheel. The
     model has no castors.
 
-    `args` is None or a pair of the torques of the motors on the right and on the left
-    wheel [N m]; without torques energy is conserved.
+    `args` is None or a pair: the torques of the motors on the right and on the left
+    wheel [N m]. Without torques, the energy is conserved.
 
     **Parameters:** `mass` m of the platform [kg], its `inertia` I about its centre of
     mass [kg m²] and the `offset` d of this centre ahead of the axle [m]; `half_track`
@@ -131,7 +131,7 @@ class TwoWheeledRobot(AbstractNonholonomicExample):
         return jnp.stack([aside, right, ahead - swing - self.radius * v[4]])
 
     def force(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Compute the generalised force of `args`, the torques of the motors."""
+        """Compute the generalised force of the motor torques in `args`."""
         what = "the torques of the motors on the right and on the left"
         torques = given_forces(args, (2,), v.dtype, what)
         return jnp.zeros_like(v).at[3:5].set(torques)

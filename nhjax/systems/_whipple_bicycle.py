@@ -52,12 +52,12 @@ class WhippleBicycle(AbstractNonholonomicExample):
     yaw, lean, pitch, steer, rear_wheel and front_wheel. In a plot of (x, y), a turn to
     the right looks like a turn to the left, because y points to the right.
 
-    The coordinates imply that the rear wheel touches the ground. The holonomic
-    constraint is the depth of the front wheel's lowest point below the ground, and Φ
-    are the horizontal velocities in space of the points of the rear and of the front
-    wheel that touch the ground. The multipliers are forces of the ground: the x and y
-    components on the rear wheel, the x and y components on the front wheel, and the z
-    component on the front wheel.
+    With these coordinates, the rear wheel always touches the ground. The holonomic
+    constraint is the depth of the front wheel's lowest point below the ground. Φ
+    contains the horizontal velocities, in space, of the points of both wheels that
+    touch the ground. The multipliers are forces of the ground: the x and y components
+    on the rear wheel, the x and y components on the front wheel, and the z component on
+    the front wheel.
 
     `WhippleBicycle.running(speed, lean=, lean_rate=, steer=, steer_rate=)` creates a
     bicycle that rolls. These arguments are zero by default, except `speed`, which is
@@ -65,7 +65,7 @@ class WhippleBicycle(AbstractNonholonomicExample):
     torque from `args`, and `LeanToSteer(lean_gain=0.0, lean_rate_gain=20.0)` is a rider
     who steers into the fall. You may also pass your own function of (t, q, v, args).
     With None, the default, the bicycle is uncontrolled, and its energy is conserved. If
-    the torque depends on `args`, also pass them to `initial_state(args=...)`.
+    the torque depends on `args`, pass `args` to `initial_state` too.
 
     The model has no stop for the handlebar. When the bicycle falls, its velocities
     therefore grow without bound, until no step size is small enough. End the run with
@@ -177,7 +177,7 @@ class WhippleBicycle(AbstractNonholonomicExample):
         )
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Compute the Lagrangian, a sum over the four bodies."""
+        """Compute the Lagrangian as a sum over the four bodies."""
         frames, rates = jax.jvp(lambda q: _frames(self, q), (q,), (v,))
         value = jnp.zeros_like(v[0])
         spins = (v[6], value, value, v[7])
@@ -345,7 +345,7 @@ def _rolling_start(
     steer_rate: Array,
     speed: Array,
 ) -> tuple[Array, Array, Array]:
-    """Compute (q0, v0) by Newton's method for the pitch and a linear solve for v.
+    """Compute q0 by Newton's method for the pitch, and v0 by a linear solve.
 
     The third result is whether both wheels touch the ground.
     """

@@ -38,17 +38,17 @@ from .._stepper import is_consistent, PlainStepper
 class Event(eqx.Module):
     """An event: a zero of a function along a trajectory, and the action taken there.
 
-    `integrate(..., event=...)` finds the zeros of `cond_fn(t, y, args)` by its sign at
-    the ends of the steps. If the sign changes in a step, the step is repeated with a
+    `integrate(..., event=...)` finds the zeros of `cond_fn(t, y, args)` from its signs
+    at the ends of the steps. If the sign changes in a step, the step is repeated with a
     size θ dt, 0 < θ <= 1, such that the function is zero, up to round-off, at the end
-    of the step. So the state at the event is the end of a step of the method. The size
+    of the step. So the state at the event is the end of a step of the method. This size
     is differentiated by the implicit function theorem. If there is a `reset`, it resets
     the state at the event. Then the run ends, or continues with the rest of the step.
 
-    If the function is zero at `t0` or right after an event, its sign is the sign of its
-    rate along the motion. So a trajectory that starts at a zero and leaves it does not
-    trigger the event at the start. If the function touches zero within a step and has
-    the same sign at both ends, the event is not detected.
+    If the function is zero at `t0` or right after an event, the sign of its rate along
+    the motion is used instead. So a trajectory that starts at a zero and leaves it does
+    not trigger the event at the start. If the function touches zero within a step and
+    has the same sign at both ends, the event is not detected.
 
     **Arguments:**
 
@@ -185,7 +185,7 @@ class ConditionSigns(eqx.Module):
         )
 
     def scale(self, h: FloatScalar) -> Float[Array, " e"]:
-        """Compute the size of each condition in a step of size h from here."""
+        """Compute |condition| or, where it is zero, its change in a step of size h."""
         value = jnp.where(self.at_zero, self.value * h, self.value)
         return jax.lax.stop_gradient(jnp.abs(value))
 
@@ -264,9 +264,9 @@ def signs_at(
 ) -> tuple[ConditionSigns, BoolScalar]:
     """Compute the signs of all conditions at a state, and whether all are finite.
 
-    A condition counts as zero if, at its present rate, it reaches zero or has left zero
-    within a small part of a step. It also counts as zero if its absolute value is not
-    larger than its `round_off`, which is measured unless it is given.
+    A condition counts as zero if, changing at its present rate, it was or will be zero
+    within a small part of a step. It also counts as zero if its absolute value is at
+    most its `round_off`. If `round_off` is None, it is measured.
     """
     step_state = jax.lax.stop_gradient(step_state)
     system, dt, args = stepper.system, stepper.dt, stepper.args
@@ -309,7 +309,7 @@ def with_continuous_multiplier(
 ) -> State:
     """Return the state with the continuous multiplier λ_c.
 
-    The states of a run have another multiplier only with the propagated closure.
+    States of a run have it already, except with the propagated closure.
     """
     if not method.carries_multiplier:
         return y
@@ -365,7 +365,7 @@ class EventActions(eqx.Module):
         ]
         terminates = tuple(event.terminate for event in events)
         room = sum(event.max_events for event in events)
-        # If every event ends the run, there is at most one.
+        # If every event ends the run, at most one event occurs.
         return cls(tuple(resets), terminates, 1 if all(terminates) else room)
 
     @property

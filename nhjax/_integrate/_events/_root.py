@@ -60,13 +60,14 @@ class ImplicitTruncatedStep(AbstractImplicitFunction[Given, TruncatedStep]):
 
     d(θ h) = - (∂g/∂h)⁻¹ dg,
 
-    with dg at fixed size. If g does not change with the size, the derivative is NaN.
+    where dg is the change of g at fixed step size. If g does not change with the size,
+    the derivative is NaN.
 
     - `step`: the step of any size.
     - `signs`: the signs of the conditions at the start of the step.
     - `truncates`: whether to truncate the step at the first event in it.
-    - `values_at_end`: if it is truncated, the values of the conditions at the end of
-        the whole step.
+    - `values_at_end`: if the step is truncated, the values of the conditions at the end
+        of the whole step.
     - `known_event`: the event at which a step of the given size is known to end, -1 for
         none; None if the event must be searched for.
     """
@@ -253,7 +254,7 @@ def _values(
 
 
 def _flat(signs: ConditionSigns, step: TruncatedStep) -> FloatScalar:
-    """Compute the change in a step below which a condition counts as constant."""
+    """Compute the bound below which a condition's change in a step counts as zero."""
     start = signs.scale(step.h)[step.fired]
     small = float(jnp.finfo(start.dtype).eps) ** 0.5
     return small * start
@@ -268,9 +269,9 @@ class Bracket(eqx.Module):
     This method needs about as many evaluations as Newton's method, and at most about
     three times as many evaluations as bisection.
 
-    - `new`, `other`, `old`: the newest point, which is one end of the interval, the
-        other end, and the point that was an end before. Each is a pair of θ and the
-        values of all functions there.
+    - `new`, `other`, `old`: the newest point, which is one end of the interval; the
+        other end; and the previous end. Each point is a pair of θ and the values of all
+        functions there.
     - `is_upper`: whether the newest point is the upper end.
     - `crossed`: the functions that have crossed zero at the upper end.
     """

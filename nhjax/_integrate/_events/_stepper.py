@@ -1,9 +1,9 @@
 """The stepper of runs with events: each iteration ends at a node or at an event.
 
-An iteration takes a step, or the rest of it after an event. If there is an event in it,
-the iteration is discarded, and the next one takes the same step again, truncated at the
-event. So each event may need two additional iterations, and an event that ends the run
-needs one.
+An iteration takes a step or, after an event, the rest of a step. If the step contains
+an event, the iteration is discarded, and the next iteration takes the same step again,
+truncated at the event. So each event may need two additional iterations, and an event
+that ends the run needs one.
 """
 
 from dataclasses import replace
@@ -65,9 +65,10 @@ class EventLoopState(eqx.Module):
     - `num_iterations`: the number of iterations so far, except idle iterations after
         the end of the run.
     - `num_events`, `last_event`: the number of events, and the index of the last one.
-    - `truncates`: whether the next step is to be truncated, since an event is in it.
-    - `values_at_end`: if it is truncated, the values of the conditions at the end of
-        the whole step.
+    - `truncates`: whether the next step must be truncated, because it contains an
+        event.
+    - `values_at_end`: if the next step is truncated, the values of the conditions at
+        the end of the whole step.
     - `signs`: the signs of the conditions.
     - `pending`: the conditions that the last resets have carried across zero, and whose
         events have not happened yet.
@@ -111,8 +112,8 @@ class ReplayedIteration(eqx.Module):
     - `scale`: the size of the condition of that event in the step.
     - `is_active`: whether the iteration took a step or handled an event without a step.
         Otherwise the iteration was idle.
-    - `was_truncated`: whether the iteration before it was discarded, because there is
-        an event in the step.
+    - `was_truncated`: whether the previous iteration was discarded, because its step
+        contains an event.
     """
 
     node: Int[Array, ""]
@@ -129,14 +130,14 @@ class ReplayedIteration(eqx.Module):
 class AttemptedStep(NamedTuple):
     """The step of an iteration, before the action of its event.
 
-    - `is_alive`: whether the run had not ended before.
+    - `is_alive`: whether the run has not ended before this iteration.
     - `is_taken`: whether a step was taken from the time `t`. An event that is pending
         happens without a step.
     - `step`: that step.
-    - `is_discarded`: whether the step is discarded, since an event was found in it.
+    - `is_discarded`: whether the step is discarded, because an event was found in it.
     - `is_kept`, `size`, `reached`: whether the step is kept, its size, and the state
         that it led to.
-    - `which`: the index of the event at its end, -1 if it ended at a node.
+    - `which`: the index of the event at the end of the step, -1 if it ended at a node.
     - `values_at_end`: if the step is truncated, the conditions at the end of the whole
         step.
     - `meets`, `fires`: whether there is an event, and whether its action is taken. The
