@@ -939,7 +939,8 @@ def _machines() -> list[Picture]:
             num_steps=125,
             curves=_lean_and_steer,
             units="angle [degrees]",
-            below="the uncontrolled bicycle steers into the fall, and rights itself",
+            below="the uncontrolled bicycle steers into the fall, and becomes upright "
+            "again",
             ground=True,
             shown=5,
             film="A bicycle that leans, steers and rights itself",
@@ -974,8 +975,8 @@ def _machines() -> list[Picture]:
             curves=_driven(3, "handlebar φ"),
             units="speed of the seat [m/s]",
             right_units="handlebar φ [rad]",
-            below="the handlebar swings, and the racer accelerates from rest, with the "
-            "seat in front",
+            below="the handlebar swings, and the racer accelerates backwards from "
+            "rest, so that the seat goes in front of the handlebar",
         ),
         _machine(
             "SliderCrank",

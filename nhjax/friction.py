@@ -407,8 +407,8 @@ class PivotingFriction(_AbstractOnContact):
     The torque about the normal n is -|N| e tanh(ω · n / ω₀). For a circular contact
     area of radius a with uniform pressure, e = 2/3 μ a.
 
-    **Arguments:** as for `RollingResistance`, with the angular velocity about the
-    normal in place of the angular velocity along the plane.
+    **Arguments:** as for `RollingResistance`, but `arm` is the length e [m] in the
+    formula above, and `smoothing` is ω₀ [rad/s] for the spin ω · n.
 
     **Raises:** as `RollingResistance`.
 

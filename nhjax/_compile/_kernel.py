@@ -63,7 +63,8 @@ def as_cpu_kernel(
     - `function`, `args`: the function, and its arguments: trees of arrays and other
         objects.
     - `programs`: a cache of traced programs. With a cache, the function is traced once
-        for each kind of arguments, and must not depend on other values.
+        for each structure, shape and dtype of the arrays in `args`, and for each value
+        of the other objects in `args`. It must not depend on values outside `args`.
     - `is_brief`: whether the program runs once and for a short time. Such a program is
         compiled in less time, to slower code.
     """

@@ -287,7 +287,7 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
         return steps(jnp.zeros((), jnp.int32), state)
 
     def _block_lengths(self, num_steps: int) -> list[int]:
-        """List the number of blocks on each level, the outermost level first."""
+        """List the number of iterations of each nested loop, the outermost first."""
         number = self.checkpoints
         number = math.isqrt(num_steps - 1) + 1 if number is None else number
         lengths, steps = [], num_steps

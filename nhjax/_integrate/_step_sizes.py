@@ -460,7 +460,7 @@ class PIDController(AbstractStepSizeController):
         )
         error, found, size = jax.lax.stop_gradient((error, found, jnp.abs(h)))
         # The growth rate of a single step may be small by chance. Therefore the stored
-        # growth rate at most halves in each step.
+        # growth rate never falls by more than a factor of 2 from step to step.
         is_first = jnp.isinf(growth_rates)
         growth_rates = jnp.where(
             is_first, found, jnp.maximum(found, 0.5 * growth_rates)
@@ -756,9 +756,9 @@ def position_sizes(
 ) -> Float[Array, " n"]:
     """Return the sizes of the n coordinates of a position, in the shape of `like`.
 
-    On a vector space the sizes are |q|. An element of another group may have more than
-    n numbers; then each of the n sizes is the largest absolute value among these
-    numbers.
+    On a flat group, such as a vector space, the size of coordinate i is |q_i|. On all
+    other groups, each of the n sizes is the largest absolute value among the numbers of
+    the element, because an element may have more than n numbers.
     """
     leaves = [jnp.ravel(jnp.abs(x)) for x in jax.tree.leaves(q)]
     flat = jnp.concatenate(leaves)

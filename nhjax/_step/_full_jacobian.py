@@ -556,7 +556,7 @@ def _rows(
 ) -> tuple[Float[Array, "r l n"], ...]:
     """Differentiate a function in each of its arguments by reverse mode.
 
-    Row i of the result depends only on row i of each argument.
+    Row i of the value of `function` must depend only on row i of each argument.
     """
     value, pull = jax.vjp(function, *args)
     units = jnp.eye(value.shape[1], dtype=value.dtype)

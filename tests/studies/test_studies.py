@@ -102,7 +102,7 @@ def test_study_run_without_json_prints_plan_table_and_verdict(tmp_path, capsys):
     headline, options, seconds, _, header, ruler, row, *rest = shown.out.splitlines()
     assert headline.startswith("Compute the energies of the CVT")
     assert "stages 3, dt 0.1, final_time 2, closure symmetric" in options
-    assert seconds == "About 10 seconds on two cores."
+    assert seconds == "About 5 seconds on two cores."
     _, verdict, *files = rest
     assert verdict.startswith("Verdict: the energy error ")
     assert "range of ΔE_d" in header
