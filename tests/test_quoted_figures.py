@@ -365,7 +365,8 @@ def test_steps_near_rest_quoted_agree_with_the_result():
     counts = [total(f"{x} judged") for x in ("refused", "accepted")]
     assert_agree(
         quoted(
-            text, "it judges all {} refused steps and a sample of {} accepted steps"
+            text,
+            "benchmark judges all {} refused steps and a sample of {} accepted steps",
         ),
         counts,
     )
@@ -494,8 +495,8 @@ def test_times_with_the_full_jacobian_quoted_agree_with_the_result():
     )
     assert_agree(quoted(text, sentence), [full["us"], default["us"], more])
     sentence = (
-        "take {} times as long for the bicycle, {} times for the four-bar linkage, {} "
-        "times for the torus and {} times for the rattleback"
+        "takes {} times as long as with the default one for the bicycle, {} times for "
+        "the four-bar linkage, {} times for the torus and {} times for the rattleback"
     )
     ratios = {
         x["name"]: x["full"]["single"] / x["default"]["single"] for x in found["errors"]
