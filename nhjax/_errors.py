@@ -235,7 +235,7 @@ def member_name(index: tuple[int, ...]) -> int | tuple[int, ...] | None:
 
 def raise_where(
     tree: T,
-    bad: Bool[Array, ""],
+    bad: Bool[Array, ""] | np.bool_,
     error: Callable[[np.ndarray, Any], Exception],
     values: PyTree[Any],
 ) -> T:
@@ -250,7 +250,7 @@ def raise_where(
     arrays = list({id(x): x for x in leaves if eqx.is_array(x)}.values())
     place = {id(x): _Place(i) for i, x in enumerate(arrays)}
     described = treedef.unflatten([place.get(id(leaf), leaf) for leaf in leaves])
-    return _raise_where(tree, bad, error, arrays, described)
+    return _raise_where(tree, jnp.asarray(bad), error, arrays, described)
 
 
 @dataclasses.dataclass(frozen=True)

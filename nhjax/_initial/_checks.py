@@ -134,7 +134,7 @@ class _Case(NamedTuple):
         return f"{self.words.constraint} = {found.lin.violation}{positions}"
 
 
-def judged(found: Found) -> list[BoolScalar | np.bool_]:
+def judge(found: Found) -> list[BoolScalar | np.bool_]:
     """Return whether each condition of `list_checks` holds, in the same order."""
     state, lin = found.state, found.lin
     singular = 10 * state.v.shape[0] * jnp.finfo(state.v.dtype).eps
@@ -159,7 +159,7 @@ def judged(found: Found) -> list[BoolScalar | np.bool_]:
 def list_checks(
     system: AbstractMechanicalSystem,
     found: Found,
-    holds: list[BoolScalar | np.bool_],
+    holds: list[BoolScalar | np.bool_ | bool],
     q: PyTree[Array],
     v: Float[Array, " n"] | None,
     p: Float[Array, " n"] | None,
@@ -168,7 +168,7 @@ def list_checks(
 ) -> list[Check]:
     """List the conditions on an initial state, each with its exception.
 
-    `holds` is the result of `judged`.
+    `holds` is the result of `judge`.
     """
     name, given = ("p", p) if v is None else ("v", v)
     words, group = _WORDS[system.generator], f"{system.manifold_of(q)}"

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._compile import as_cpu_kernel, tracked_jit
 from .._custom_types import Args, BoolScalar, FloatScalar, FloatScalarLike
-from .._errors import DTypeError, on_host, require, ShapeError, undecided
+from .._errors import DTypeError, is_traced, require, ShapeError, undecided
 from .._numerics import (
     active_ranks,
     has_zero_row,
@@ -46,7 +46,7 @@ from .._system import (
     violation_scale,
     with_kept_functions,
 )
-from ._checks import Found, judged, list_checks
+from ._checks import Found, judge, list_checks
 from ._projection import (
     checked_keep,
     Chosen,
@@ -168,8 +168,8 @@ def initial_state(
     if throw:
         # Only traced inputs are checked together with the solution, in one call-back.
         inputs = undecided(*inputs)
-    found, holds = _solve(system, t, q, v, p, args, project, keep)
-    holds = on_host(holds)
+    found, judged = _solve(system, t, q, v, p, args, project, keep)
+    holds = [x if is_traced(x) else bool(x) for x in judged]
     checks = inputs + list_checks(system, found, holds, q, v, p, project, keep)
     if throw:
         return require(found.state, *checks)
@@ -194,7 +194,7 @@ def _solve(
 
 def _found_and_judged(*given: Any) -> tuple[Found, list[BoolScalar | np.bool_]]:
     found = _found(*given)
-    return found, judged(found)
+    return found, judge(found)
 
 
 def _found(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> Found:
