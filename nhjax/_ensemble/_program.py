@@ -97,8 +97,12 @@ class Job:
         inputs = self._on_devices(self._inputs(chunk))
         return _values_of_chunk(self.run, self.members.make, inputs, self.layout, None)
 
-    def states(self, chunk: int, reductions: Any) -> ChunkResult:
+    def states(
+        self, chunk: int, reductions: Any, is_used: tuple[bool, ...]
+    ) -> ChunkResult:
         """Start a chunk that returns states of reductions; do not wait for it.
+
+        `is_used` is the result of `used_arrays`.
 
         The reductions are a separate program, which takes long to compile and depends
         only on the shapes of the values. Runs with different methods can therefore
@@ -107,7 +111,6 @@ class Job:
         is_member = np.arange(self.chunk_size) < self.num_members(chunk)
         inputs, is_member = self._on_devices((self._inputs(chunk), is_member))
         shapes = without_results(self.structure)
-        is_used = _is_used(reductions, shapes)
         made = _values_of_chunk(
             self.run, self.members.make, inputs, self.layout, is_used
         )
@@ -301,7 +304,7 @@ def _values_of_chunk(
 
 
 @tracked_jit("reductions")
-def _is_used(reductions: Any, shapes: Any) -> tuple[bool, ...]:
+def used_arrays(reductions: Any, shapes: Any) -> tuple[bool, ...]:
     """Return which arrays of a value the reductions use.
 
     Arrays that are not used need not be stored, and XLA may not even compute them.
@@ -453,11 +456,10 @@ def first_failure(value: Any) -> tuple[Int[Array, ""], Int[Array, ""]]:
         for parts in (codes, steps)
     ]
     # If there is no failure, this search finds the success that is appended above.
-    is_last = jnp.arange(flat[0].shape[0]) == flat[0].shape[0] - 1
-    first = jnp.argmax(~is_success(flat[0]) | is_last)
+    index = jnp.arange(len(flat[0]))
+    first = jnp.argmax(~is_success(flat[0]) | (index == len(flat[0]) - 1))
     # XLA compiles a sum in less time than a lookup.
-    is_first = jnp.arange(flat[0].shape[0]) == first
-    code, step = [jnp.sum(x, where=is_first, dtype=x.dtype) for x in flat]
+    code, step = [jnp.sum(x, where=index == first, dtype=x.dtype) for x in flat]
     return code, step
 
 

@@ -539,12 +539,10 @@ def _as_doubles(vectors: list["DoubleDouble"], tree: Any) -> Any:
     place = {x.high.dtype: (x, 0) for x in vectors}
 
     def part(like: DoubleDouble) -> DoubleDouble:
-        shape, dtype = like.high.shape, like.high.dtype
-        vector, start = place[dtype]
-        place[dtype] = vector, start + like.high.size
-        return DoubleDouble(
-            *[x[start : start + like.high.size].reshape(shape) for x in vector]
-        )
+        vector, start = place[like.high.dtype]
+        end = start + like.high.size
+        place[like.high.dtype] = vector, end
+        return DoubleDouble(*[x[start:end].reshape(like.high.shape) for x in vector])
 
     return _map(part, tree)
 

@@ -28,6 +28,7 @@ from ._program import (
     manifest,
     merged_states,
     program_text,
+    used_arrays,
     without_addresses,
     without_results,
 )
@@ -238,6 +239,7 @@ class ReductionSink(AbstractSink):
             each_reduction(lambda each: each.init(structure), reductions)
         )
         self.state = self.neutral
+        self.is_used = used_arrays(reductions, structure)
 
     def description(self) -> tuple[dict[str, Any], str]:
         """Return the manifest of the job and the text of its program."""
@@ -261,7 +263,7 @@ class ReductionSink(AbstractSink):
 
     def start(self, chunk: int) -> ChunkResult:
         """Start the program of a chunk, without waiting for its result."""
-        return self.job.states(chunk, self.reductions)
+        return self.job.states(chunk, self.reductions, self.is_used)
 
     def collect(self, chunk: int, content: Any, failures: list[list[int]]) -> None:
         """Merge the state of a chunk, or the states of a round of chunks."""

@@ -219,7 +219,7 @@ def test_initial_state_in_compiled_programs_passes_few_arrays_to_host(monkeypatc
         return pure_callback(function, shape, *arrays, **options)
 
     monkeypatch.setattr(jax, "pure_callback", observed)
-    # A new system is traced anew.
+    # No other test has traced this system, so that it is traced here.
     system = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v - q[0])
     q = jnp.ones((2, 3))
     jax.make_jaxpr(jax.vmap(lambda q: nhjax.initial_state(system, q, q)))(q)
