@@ -63,7 +63,7 @@ import nhjax
 from nhjax import systems
 from nhjax._method import AbstractMethod
 from nhjax._numerics import max_norm, NOISE_UNITS, nonzero_or_one
-from nhjax._step import step, StepOutcome, StepState
+from nhjax._step import ImplicitStep, StepOutcome, StepState
 from nhjax._step._equations import (
     stage_residual,
     StageEquations,
@@ -258,7 +258,10 @@ def run(
             arguments = replace(start, t=k * h, step_state=step_state)
             stages = equations_of_step(arguments, method)
             first, second = (
-                step(arguments, method, solver, go_on) for solver in solvers
+                ImplicitStep(method=method, stage_solver=solver, skip=go_on).solve(
+                    arguments
+                )
+                for solver in solvers
             )
             row = compared(step_state.state, stages, first, second)
             good = first.result == nhjax.RESULTS.successful
@@ -295,7 +298,12 @@ def single_steps(
     def one(start):
         arguments = near_rest.first_arguments(system, method, *start)
         stages = equations_of_step(arguments, method)
-        first, second = (step(arguments, method, solver, go_on) for solver in solvers)
+        first, second = (
+            ImplicitStep(method=method, stage_solver=solver, skip=go_on).solve(
+                arguments
+            )
+            for solver in solvers
+        )
         return compared(start[0], stages, first, second)
 
     return jax.lax.map(one, (starts, sizes))
@@ -471,7 +479,9 @@ def moved_by_last_digit(
         arguments = near_rest.first_arguments(
             system, method, unravel(z * (1 + eps * move)), h
         )
-        return step(arguments, method, nhjax.Newton(), jnp.asarray(False))
+        never = jnp.asarray(False)
+        step = ImplicitStep(method=method, stage_solver=nhjax.Newton(), skip=never)
+        return step.solve(arguments)
 
     ends = jax.lax.map(end, moves)
     first, others = (

@@ -42,7 +42,7 @@ from jaxtyping import Array, Float
 import nhjax
 from nhjax import systems
 from nhjax._numerics import max_norm
-from nhjax._step import first_step_state, step, StepArguments
+from nhjax._step import first_step_state, ImplicitStep, StepArguments
 from nhjax._step._equations import stage_residual, StageUnknowns
 from nhjax._step._jacobian import increment_size
 from nhjax._step._step import equations_of_step
@@ -103,7 +103,9 @@ def steps(system, method, solver, y0, h) -> Tried:
     def advance(carry, k):
         step_state, alive = carry
         arguments = replace(first, t=k * h, step_state=step_state)
-        outcome = step(arguments, method, solver, ~alive)
+        outcome = ImplicitStep(method=method, stage_solver=solver, skip=~alive).solve(
+            arguments
+        )
         good = alive & (outcome.result == nhjax.RESULTS.successful)
         after = jax.tree.map(
             lambda new, old: jnp.where(good, new, old), outcome.step_state, step_state

@@ -77,15 +77,8 @@ def as_cpu_kernel(
     key = function, treedef, structure, *others, *map(jax.typeof, leaves)
     traced = None if programs is None else programs.find(key)
     if traced is None:
-        kept = []
-
-        def flat(*leaves):
-            args = eqx.combine(jax.tree.unflatten(treedef, leaves), static)
-            arrays, rest = eqx.partition(function(*args), eqx.is_array)
-            kept.append((jax.tree.structure(arrays), rest))
-            return jax.tree.leaves(arrays)
-
-        traced = _Traced(cse_dce(jax.make_jaxpr(flat)(*leaves)), *kept[0])
+        program, shapes, rest = eqx.filter_make_jaxpr(function)(*args)
+        traced = _Traced(cse_dce(program), jax.tree.structure(shapes), rest)
         if programs is not None:
             programs.keep(key, traced)
     out = run_program(traced.program, leaves, CompileOptions(is_brief))

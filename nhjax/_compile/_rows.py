@@ -40,23 +40,16 @@ def vmapped(function: Callable[..., T], *rows: Any, out_axis: int = 0) -> T:
     - `rows`: trees of arrays that have the same first axis.
     - `out_axis`: the axis of the results that lists the rows.
     """
-    leaves, treedef = jax.tree.flatten(rows)
-    structure = None
-
-    def flat(*leaves):
-        nonlocal structure
-        out = function(*jax.tree.unflatten(treedef, leaves))
-        leaves, structure = jax.tree.flatten(out)
-        return leaves
-
     # With `jax.disable_jit`, the user wants to step through single operations.
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
         return jax.vmap(function, out_axes=out_axis)(*rows)
-    row = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in leaves]
-    program = cse_dce(jax.make_jaxpr(flat)(*row))
+    row = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), rows)
+    program, results = jax.make_jaxpr(function, return_shape=True)(*row)
+    program, structure = cse_dce(program), jax.tree.structure(results)
     if program.effects:
         return jax.vmap(function, out_axes=out_axis)(*rows)
     shared, program = split_by_operands(program)
+    leaves = jax.tree.leaves(rows)
     number = leaves[0].shape[0]
     if number == 1 or number * num_results(program.jaxpr) < SHORTEST_IN_LOOP:
         in_axes = [*[None] * len(shared), *[0] * len(leaves)]

@@ -228,7 +228,7 @@ def _found(system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]) -> 
     return Found(
         state=state,
         lin=lin,
-        generator=system.call(system.generator, t, q, u, args),
+        generator=system.named(system.generator)(t, q, u, args),
         positions=positions,
         off_group=at.off_group,
         regularity=reciprocal_condition(system.metric(t, q, u, args)),

@@ -24,7 +24,6 @@ from ._step import (
     first_step_state as first_step_state,
     ImplicitStep as ImplicitStep,
     largest_violation as largest_violation,
-    step as step,
     StepArguments as StepArguments,
     StepOutcome as StepOutcome,
     StepRecord as StepRecord,

@@ -1,8 +1,8 @@
 """One step of a method, its derivative, and the data that one step passes to the next.
 
-`step` solves the stage equations and computes the state at the end. `ImplicitStep` is
-the same step as a differentiable function. `AbstractStageSolver` is the interface of
-the solvers of the stage equations.
+`ImplicitStep` solves the stage equations and computes the state at the end, as a
+differentiable function. `AbstractStageSolver` is the interface of the solvers of the
+stage equations.
 """
 
 from abc import abstractmethod
@@ -258,66 +258,6 @@ class _ContinuousMultiplier(AbstractImplicitFunction[Any, Float[Array, " l"]]):
         return zero_unless(ok, change)
 
 
-def step(
-    arguments: StepArguments,
-    method: AbstractMethod,
-    stage_solver: AbstractStageSolver,
-    skip: BoolScalar,
-) -> StepOutcome:
-    """Take one step of size h, from (q_k, p_k, λ_k) to (q_{k+1}, p_{k+1}, λ_{k+1}).
-
-    Where `skip` is true, no iterations are made, and the caller must discard the
-    outcome.
-    """
-    system, args, step_state = arguments.system, arguments.args, arguments.step_state
-    t, h, keeps_invariants = arguments.t, arguments.h, arguments.invariants is not None
-    state, lin = step_state.state, step_state.lin
-    stages = equations_of_step(arguments, method)
-    x0 = starting_values(stages, system.fibre_coordinate(state), lin)
-    solved = stage_solver.solve(stages, x0, lin, skip)
-    x, forces = solved.x, solved.aux.forces
-
-    chart = stages.chart(x)
-    q, q_compensation = chart.advance(state.q, step_state.q_compensation)
-    at_end = chart.manifold.wrapped(q, q_compensation)
-    gained = h * small_einsum("s,sn->n", stages.coefficients("b"), forces.force)
-    p, p_compensation = state.p, step_state.p_compensation
-    if keeps_invariants:
-        p_compensation = p_compensation + start_impulse(stages, x)
-    p, p_compensation = chart.advance_momentum(p, gained, p_compensation)
-    if keeps_invariants:
-        p, p_compensation = two_sum(p, p_compensation + end_impulse(stages, x))
-    u = p if stages.hamiltonian else x.node_fibre_coordinate[-1]
-    lin_next = linearise(system, t + h, at_end, u, args, may_be_sparse=True)
-    last = forces.multiplier[-1]
-    end = end_state(stages, at_end, u, p, last, lambda: lin_next.multiplier)
-    next_state = StepState(replace(end, q=q), q_compensation, p_compensation, lin_next)
-
-    result = _result(solved, lin, next_state, is_in_chart(stages, x))
-    if stages.redundancy is not None:
-        small = float(jnp.finfo(p.dtype).eps) ** 0.5 + 100 * stage_solver.tolerance
-        allowed = None if stages.noise is None else stages.noise.violations
-        holds = keeps_constraints(system, lin_next, t + h, end, args, small, allowed)
-        lost = (result == RESULTS.successful) & ~holds
-        result = RESULTS.where(lost, RESULTS.lost_constraints, result)
-    residual, worst = largest_column(forces.residual, solved.aux.node_residual)
-    scale = max_norm(forces.momentum) + max_norm(h * forces.force)
-    return StepOutcome(
-        step_state=next_state,
-        record=step_record(stages, state, x, forces),
-        stages=x,
-        result=result,
-        num_iterations=solved.num_iterations,
-        residual=relative(residual, scale),
-        worst_coordinate=worst,
-        constraint_violation=largest_violation(system, t + h, next_state, args),
-        multiplier_defect=max_norm(last - lin_next.multiplier),
-        newton=solved.aux.newton,
-        invariant_error=_invariant_error(stages, at_end, u),
-        error_ratios=error_ratios(stages, x, forces.force, u, lin),
-    )
-
-
 def equations_of_step(
     arguments: StepArguments, method: AbstractMethod
 ) -> StageEquations:
@@ -559,28 +499,81 @@ class FrozenIteration(NamedTuple):
 
 
 class ImplicitStep(AbstractImplicitFunction[StepArguments, StepOutcome]):
-    """A step as a differentiable function of its arguments.
+    """A step of size h, from (q_k, p_k, λ_k) to (q_{k+1}, p_{k+1}, λ_{k+1}).
 
-    Let G(θ, x) be the Newton iteration of the stage solver on the stages x, with its
-    Jacobian fixed, and let θ be the arguments of the step. The solution is a fixed
-    point of G, so that
+    The step is a differentiable function of its arguments. Let G(θ, x) be the Newton
+    iteration of the stage solver on the stages x, with its Jacobian fixed, and let θ be
+    the arguments of the step. The solution is a fixed point of G, so that
 
     dx = ∂G/∂x dx + ∂G/∂θ dθ,
 
     and the end of the step follows from x and θ. All derivatives are zero where the
     step failed.
 
-    - `method`, `stage_solver`, `skip`: as for `step`.
+    - `method`: the method.
+    - `stage_solver`: the solver of the stage equations.
+    - `skip`: if it is true, no iterations are made, and the caller must discard the
+        outcome.
     """
 
     method: AbstractMethod = eqx.field(static=True)
     stage_solver: AbstractStageSolver
     skip: BoolScalar
-    programs: TraceCache = eqx.field(static=True)
+    programs: TraceCache | None = eqx.field(static=True, default=None)
 
     def solve(self, arguments: StepArguments) -> StepOutcome:
         """Take the step."""
-        return step(arguments, self.method, self.stage_solver, self.skip)
+        system, t, h = arguments.system, arguments.t, arguments.h
+        args, step_state = arguments.args, arguments.step_state
+        keeps_invariants = arguments.invariants is not None
+        state, lin = step_state.state, step_state.lin
+        stages = equations_of_step(arguments, self.method)
+        x0 = starting_values(stages, system.fibre_coordinate(state), lin)
+        solved = self.stage_solver.solve(stages, x0, lin, self.skip)
+        x, forces = solved.x, solved.aux.forces
+
+        chart = stages.chart(x)
+        q, q_compensation = chart.advance(state.q, step_state.q_compensation)
+        at_end = chart.manifold.wrapped(q, q_compensation)
+        gained = h * small_einsum("s,sn->n", stages.coefficients("b"), forces.force)
+        p, p_compensation = state.p, step_state.p_compensation
+        if keeps_invariants:
+            p_compensation = p_compensation + start_impulse(stages, x)
+        p, p_compensation = chart.advance_momentum(p, gained, p_compensation)
+        if keeps_invariants:
+            p, p_compensation = two_sum(p, p_compensation + end_impulse(stages, x))
+        u = p if stages.hamiltonian else x.node_fibre_coordinate[-1]
+        lin_next = linearise(system, t + h, at_end, u, args, may_be_sparse=True)
+        last = forces.multiplier[-1]
+        end = end_state(stages, at_end, u, p, last, lambda: lin_next.multiplier)
+        unwrapped = replace(end, q=q)
+        next_state = StepState(unwrapped, q_compensation, p_compensation, lin_next)
+
+        result = _result(solved, lin, next_state, is_in_chart(stages, x))
+        if stages.redundancy is not None:
+            small = float(jnp.finfo(p.dtype).eps) ** 0.5
+            small = small + 100 * self.stage_solver.tolerance
+            allowed = None if stages.noise is None else stages.noise.violations
+            given = system, lin_next, t + h, end, args, small, allowed
+            holds = keeps_constraints(*given)
+            lost = (result == RESULTS.successful) & ~holds
+            result = RESULTS.where(lost, RESULTS.lost_constraints, result)
+        residual, worst = largest_column(forces.residual, solved.aux.node_residual)
+        scale = max_norm(forces.momentum) + max_norm(h * forces.force)
+        return StepOutcome(
+            step_state=next_state,
+            record=step_record(stages, state, x, forces),
+            stages=x,
+            result=result,
+            num_iterations=solved.num_iterations,
+            residual=relative(residual, scale),
+            worst_coordinate=worst,
+            constraint_violation=largest_violation(system, t + h, next_state, args),
+            multiplier_defect=max_norm(last - lin_next.multiplier),
+            newton=solved.aux.newton,
+            invariant_error=_invariant_error(stages, at_end, u),
+            error_ratios=error_ratios(stages, x, forces.force, u, lin),
+        )
 
     def tangent(
         self, arguments: StepArguments, rates: StepArguments, solution: StepOutcome
@@ -660,9 +653,9 @@ def _end(
 ) -> tuple[State, StepRecord]:
     """Compute the state at the end of a step and its record, given only the stages.
 
-    `step` computes the same end up to round-off. Here p follows from the fibre
-    coordinate at the end, and there are no compensated sums, because the compensation
-    has no derivative.
+    `ImplicitStep.solve` computes the same end up to round-off. Here p follows from the
+    fibre coordinate at the end, and there are no compensated sums, because the
+    compensation has no derivative.
     """
     system, args, start = arguments.system, arguments.args, arguments.step_state.state
     stages = equations_of_step(arguments, method)

@@ -248,13 +248,6 @@ class AbstractMechanicalSystem(eqx.Module):
             if getattr(self, name) is not None
         }
 
-    def call(self, name: str, *arguments: Any) -> Any:
-        """Call a function of the system, and add a note to an error that it raises.
-
-        The note says which function of the system raised the error.
-        """
-        return self.named(name)(*arguments)
-
     def named(self, name: str) -> "NamedFunction":
         """Return a function of the system whose errors name the function."""
         called = f"{name}({', '.join(self.signatures()[name])})"
@@ -270,7 +263,7 @@ class AbstractMechanicalSystem(eqx.Module):
     ) -> Float[Array, " n"]:
         """Compute the user's force F; the system must have a force."""
         given = (multiplier,) if self.force_takes_multipliers else ()
-        force = self.call("force", t, q, u, *given, args)
+        force = self.named("force")(t, q, u, *given, args)
         # A scalar would act on all coordinates. `initial_state` detects this error, but
         # a run may use another system.
         if jnp.shape(force) != u.shape:
@@ -316,7 +309,7 @@ class AbstractMechanicalSystem(eqx.Module):
         """Compute the holonomic constraints Γ(t, q), of shape (k,), k = 0 if none."""
         if self.holonomic is None:
             return jnp.zeros((0,), jax.tree.leaves(q)[0].dtype)
-        return jnp.atleast_1d(self.call("holonomic", t, q, args))
+        return jnp.atleast_1d(self.named("holonomic")(t, q, args))
 
     def kinematic_constraint(
         self,
@@ -328,7 +321,7 @@ class AbstractMechanicalSystem(eqx.Module):
         """Compute the nonholonomic constraints, of shape (m,) with m = 0 if none."""
         if self.nonholonomic is None:
             return jnp.zeros((0,), u.dtype)
-        return jnp.atleast_1d(self.call("nonholonomic", t, q, u, args))
+        return jnp.atleast_1d(self.named("nonholonomic")(t, q, u, args))
 
     def holonomic_rate(
         self,
@@ -500,7 +493,7 @@ class LagrangianSystem(AbstractMechanicalSystem):
         args: Args = None,
     ) -> Float[Array, " n"]:
         """Compute the momentum p = D2L(t, q, u), the Legendre transform of u."""
-        return jax.grad(self.call, argnums=3)("lagrangian", t, q, u, args)
+        return jax.grad(self.named("lagrangian"), argnums=2)(t, q, u, args)
 
     def velocity(
         self,
@@ -531,7 +524,7 @@ class LagrangianSystem(AbstractMechanicalSystem):
     ) -> Float[Array, " n"]:
         """Compute L_q^* D1L, the derivative of L with respect to the position."""
         return self.manifold_of(q).left_gradient(
-            lambda g: self.call("lagrangian", t, g, u, args), q
+            lambda g: self.named("lagrangian")(t, g, u, args), q
         )
 
     def flat(
@@ -567,7 +560,7 @@ class LagrangianSystem(AbstractMechanicalSystem):
         """
         check_time_and_state("energy", t, y)
         p = self.momentum(t, y.q, y.v, args)
-        return jnp.sum(p * y.v) - self.call("lagrangian", t, y.q, y.v, args)
+        return jnp.sum(p * y.v) - self.named("lagrangian")(t, y.q, y.v, args)
 
 
 class HamiltonianSystem(AbstractMechanicalSystem):
@@ -650,7 +643,7 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         args: Args = None,
     ) -> Float[Array, " n"]:
         """Compute the velocity v = D2H(t, q, u)."""
-        return jax.grad(self.call, argnums=3)("hamiltonian", t, q, u, args)
+        return jax.grad(self.named("hamiltonian"), argnums=2)(t, q, u, args)
 
     def metric(
         self,
@@ -671,7 +664,7 @@ class HamiltonianSystem(AbstractMechanicalSystem):
     ) -> Float[Array, " n"]:
         """Compute -L_q^* D1H from the derivative of H with respect to the position."""
         return -self.manifold_of(q).left_gradient(
-            lambda g: self.call("hamiltonian", t, g, u, args), q
+            lambda g: self.named("hamiltonian")(t, g, u, args), q
         )
 
     def flat(
@@ -692,7 +685,7 @@ class HamiltonianSystem(AbstractMechanicalSystem):
         The arguments are the same as for `LagrangianSystem.energy`.
         """
         check_time_and_state("energy", t, y)
-        return self.call("hamiltonian", t, y.q, y.p, args)
+        return self.named("hamiltonian")(t, y.q, y.p, args)
 
 
 S = TypeVar("S", bound=AbstractMechanicalSystem)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 import nhjax
-from nhjax._step import first_step_state, step, StepArguments
+from nhjax._step import first_step_state, ImplicitStep, StepArguments
 from nhjax._step._equations import StageUnknowns
 from nhjax._system import State
 from support import group_mechanics as by_hand
@@ -340,10 +340,11 @@ def solved_steps(
 ) -> list[SolvedStep]:
     """Consecutive steps from a state at t = 0, as NumPy arrays."""
     never = jnp.asarray(False)
+    step = ImplicitStep(method=method, stage_solver=solver, skip=never)
 
     def advance(step_state, t):
         arguments = StepArguments(system, t, jnp.asarray(h), step_state, None)
-        outcome = step(arguments, method, solver, never)
+        outcome = step.solve(arguments)
         x, record = outcome.stages, outcome.record
         taken = SolvedStep(
             step_state.state,

@@ -79,7 +79,7 @@ class ImplicitTruncatedStep(AbstractImplicitFunction[Given, TruncatedStep]):
     known_event: Int[Array, ""] | None
 
     @property
-    def programs(self) -> TraceCache:
+    def programs(self) -> TraceCache | None:
         """Return the cache of the step."""
         return self.step.programs
 
