@@ -117,8 +117,8 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-# These names are imported at their first use, because importing them at once would
-# take a quarter of the time of `import nhjax`. The value is the package that contains
+# These names are imported at their first use, because importing them immediately would
+# take a quarter of the time of `import nhjax`. Each value is the package that contains
 # the name, or None if the name is a module.
 _LOADED_LATER = {
     **dict.fromkeys(("forces", "friction", "plot", "rolling", "systems")),

@@ -152,7 +152,7 @@ def _add_options(parser: argparse.ArgumentParser, function: Callable) -> None:
 
 
 def _number(text: str) -> float:
-    """Parse a number, which may be a float or a fraction of π such as pi/10."""
+    """Parse a float or "pi", which may be divided by a number, as in pi/10."""
     numerator, slash, denominator = text.partition("/")
     value = math.pi if numerator == "pi" else float(numerator)
     divisor = float(denominator) if slash else 1.0

@@ -242,8 +242,8 @@ def raise_where(
     """Return `tree`; where `bad` holds, raise when the compiled program runs.
 
     The exception is `error(bad, values)`, called with NumPy arrays on the host. Under
-    `vmap` all these arrays have the batch as leading axes: a message with numbers needs
-    a call-back, and this call-back receives all members of a batch.
+    `vmap` all these arrays have the batch as leading axes, because the call-back that
+    creates the exception receives all members of a batch.
     """
     # The same array often belongs to several checks, and is passed only once.
     leaves, treedef = jax.tree.flatten(values)
@@ -298,7 +298,7 @@ def _raise_where(
 def _packed(arrays: list[Array]) -> tuple[list[Array], list[tuple[int, slice]]]:
     """Join the arrays of each dtype to a vector; return also where each array is.
 
-    XLA would compile a kernel for each array that is converted to bits.
+    Otherwise XLA would compile a kernel for each array that is converted to bits.
     """
     groups: dict[Any, list[Array]] = {}
     slices = []

@@ -139,7 +139,7 @@ def load(path: str | os.PathLike[str]) -> Any:
     **Raises:** `FileNotFoundError` if the file does not exist, `IsADirectoryError` if
     it is a folder; `ValueError` if `save` has not written it, if it is damaged, or if a
     later release has written it in a format that this release does not know;
-    `DTypeError` if the file has float64 arrays and JAX would round them to float32.
+    `DTypeError` if JAX would round an array in the file, such as float64 to float32.
 
     !!! example
 

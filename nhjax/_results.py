@@ -27,7 +27,7 @@ EVENT_OCCURRED = "An event ended the run, as requested; this is not a failure."
 
 # When a result is printed, the metaclass of its enumeration looks up its text.
 class _Named(type(eqx.Enumeration)):
-    """An enumeration whose items have texts that begin with their names."""
+    """The metaclass of `RESULTS`: the texts of results begin with their names."""
 
     def __getitem__(cls, item: Any) -> str:
         is_known = isinstance(item, cls) and eqx.is_array_like(item._value)
@@ -42,7 +42,7 @@ class _Named(type(eqx.Enumeration)):
 
 
 def _counted(codes: np.ndarray, names: dict[int, str]) -> str:
-    """Count the results of many runs by name; add the first run with each result."""
+    """Count many runs by result, with the first run of each result except success."""
     parts = []
     for code in np.unique(codes):
         where, name = np.argwhere(codes == code), names[int(code)]

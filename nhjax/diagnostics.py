@@ -68,9 +68,10 @@ def momentum_map(
 ) -> Float[Array, "..."]:
     """Compute the momentum p · ξ_Q(q) along an infinitesimal symmetry ξ_Q.
 
-    The momentum is conserved if ξ_Q is a symmetry of the Lagrangian and the constraints
-    permit the virtual displacement ξ_Q, that is, D2Φ · ξ_Q = 0. Otherwise the momentum
-    satisfies the nonholonomic momentum equation.
+    The momentum is conserved if ξ_Q is a symmetry of the Lagrangian, the constraints
+    permit the virtual displacement ξ_Q, that is, D2Φ · ξ_Q = 0, and external forces do
+    no work along ξ_Q. Otherwise the momentum satisfies the nonholonomic momentum
+    equation.
 
     **Arguments:**
 
@@ -123,13 +124,14 @@ def convergence_order(
 
     **Arguments:**
 
-    - `step_sizes`: at least two different step sizes, shape (k,).
+    - `step_sizes`: at least two step sizes, shape (k,).
     - `errors`: the error for each step size, shape (k, ...).
 
     **Returns:** a NumPy array of shape (k - 1, ...).
 
-    **Raises:** `ValueError` if step sizes are equal, zero or not finite, or if errors
-    are not positive and finite; `TypeError` if they are not numbers.
+    **Raises:** `ValueError` if successive step sizes are equal, if a step size is zero
+    or not finite, or if errors are not positive and finite; `TypeError` if an argument
+    has entries that are not numbers.
 
     !!! example
 

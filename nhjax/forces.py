@@ -148,7 +148,7 @@ class AbstractForce(AbstractSummable):
     respect to them are available. A new function causes a recompilation.
 
     A `HamiltonianSystem` passes momenta, not velocities, to its forces. Therefore use
-    `Drag`, `Motor` and a `Spring` with a damper only in a `LagrangianSystem`.
+    `Drag`, `Motor`, `Brake` and a `Spring` with a damper only in a `LagrangianSystem`.
 
     To define a force, write a subclass with this method:
 
@@ -382,8 +382,8 @@ class Spring(_AbstractPulledBack):
     points stay apart.
 
     `system.energy` does not include the energy of a `Spring`. To include it, add
-    -½ k (|d| - l)² to the Lagrangian instead of using a `Spring`. The computed steps
-    are the same. This is possible only without a damper.
+    -½ k (|d| - l)² to the Lagrangian instead of using a `Spring`. Both give the same
+    steps. A damper cannot be included in this way.
 
     **Arguments:**
 

@@ -1,10 +1,11 @@
 """Friction in contacts, joints and tyres, proportional to the load that they carry.
 
 The load of a contact is a reaction, so that these forces depend on the multipliers. All
-laws are smooth: at speeds far below a parameter u₀, the friction is proportional to the
-velocity. A contact that should rest on an incline therefore creeps. If holding it takes
-the fraction r < 1 of the largest friction, its speed is u₀ artanh(r). Near rest, the
-iteration of a step converges fast for steps up to about u₀ · mass / friction.
+laws are smooth: near rest, the friction is proportional to the velocity. A contact that
+should rest on an incline therefore creeps. If holding it takes the fraction r < 1 of
+the largest friction, a contact with the law `Coulomb` creeps at u₀ artanh(r), where u₀
+is the parameter `smoothing`. Near rest, the iteration of a step converges fast for time
+steps up to about u₀ · mass / friction.
 """
 
 import abc
@@ -98,7 +99,7 @@ class Coulomb(AbstractFrictionLaw):
 
 
 class Stribeck(AbstractFrictionLaw):
-    """Stribeck's law: static friction that falls to kinetic friction.
+    """Stribeck's law: the friction falls from static to kinetic as the speed grows.
 
     μ(u) = (μ_k + (μ_s - μ_k) exp(-(u / u_s)²)) tanh(u / u₀) + c u.
 
@@ -215,7 +216,7 @@ class _AbstractOnContact(AbstractForceOfReactions):
 
     @abc.abstractmethod
     def _rate(self, contact: AbstractContact, at: ContactState) -> Array:
-        """Return the velocity r."""
+        """Return the velocity or angular velocity r."""
 
     @abc.abstractmethod
     def _slope(self, at: ContactState, rate: Array) -> Array:
@@ -254,7 +255,8 @@ class Sliding(_AbstractOnContact):
 
     The force on the body is -|N| μ(u) in the direction of the velocity u at which the
     contact slides. u is the part of the contact's velocity that its constraints leave
-    free: the whole velocity if `no_slip=()`, or the velocity along the edge of a blade.
+    free: all of the velocity along the plane if `no_slip=()`, or the velocity along the
+    edge of a blade.
 
     **Arguments:**
 
@@ -314,8 +316,8 @@ class Tyre(_AbstractOnContact):
 
     - `contacts`, `contact`: the contacts of the system, and the name of one of them.
     - `law`: μ(σ), a `LinearSlip` or a `MagicFormula`.
-    - `slowest`: V₀ [m/s]. The ratio u / V is not defined at rest. Below V₀ the tyre
-        therefore acts like a damper.
+    - `slowest`: V₀ [m/s], which keeps the slip defined at rest. Below V₀ the tyre acts
+        like a damper.
     - `load`: as for `Sliding`.
 
     **Raises:** as `Sliding`.

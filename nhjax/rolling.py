@@ -166,7 +166,7 @@ class Plane(AbstractGround):
     )
 
     def unit_normal(self, dtype: Any) -> Float[Array, "3"]:
-        """Return n / |n| in a precision."""
+        """Return n / |n| with the given dtype."""
         return _unit(jnp.asarray(self.normal).astype(dtype))
 
     def touch(
@@ -175,7 +175,7 @@ class Plane(AbstractGround):
         position: Float[Array, "3"],
         args: Args,
     ) -> Touch:
-        """Find the lowest point of a body."""
+        """Find the point of a body that is farthest in the direction -n."""
         normal = self.unit_normal(position.dtype)
         point = support(normal)
         height = jnp.asarray(self.height).astype(point.dtype)
@@ -349,7 +349,8 @@ NoSlip: TypeAlias = tuple[Literal["along", "across", "spin"] | float, ...]
 class AbstractContact(eqx.Module):
     """A convex body that touches the ground in one point.
 
-    To define a shape, write a subclass with the fields below and two methods:
+    To define a shape, write a subclass with the fields of `Ellipsoid` except
+    `semi_axes`, and two methods:
 
     - `offset(rotation, normal, args)`: the vector in space from the origin of the body
         to its point that is farthest in the direction -normal.
@@ -648,7 +649,7 @@ class Ellipsoid(AbstractContact):
         axes = self._axes_in(args, rotation.dtype)
         if axes.shape == ():
             return -axes * normal
-        # The support function of the ellipsoid in the direction -n.
+        # The point of the ellipsoid that is farthest in the direction -n.
         scaled = axes * (rotation.T @ normal)
         return -rotation @ (axes * _unit(scaled))
 
@@ -664,8 +665,8 @@ class Ellipsoid(AbstractContact):
 class Blade(AbstractContact):
     """A blade, a skate or a keel that does not move sideways.
 
-    The direction `across` is its lateral direction, along the ground, and `along` =
-    `across` x n.
+    The direction `across` is the lateral direction of the blade, projected onto the
+    ground, and `along` = `across` x n.
 
     **Arguments:**
 
@@ -836,7 +837,7 @@ class Contacts(eqx.Module):
         }
 
     def _in_frames(self, multipliers: Array) -> dict[str, Array]:
-        """Compute the forces along, across and normal to the ground."""
+        """Compute the components `along`, `across` and normal of each force."""
         self._check_multipliers(multipliers)
         counts = [len(x.no_slip) for x in self.contacts]
         parts = jnp.split(multipliers[: sum(counts)], np.cumsum(counts)[:-1])
@@ -857,7 +858,8 @@ class Contacts(eqx.Module):
         - `multipliers`: the multipliers of the system.
 
         **Raises:** `ValueError` if the contact has `touches=False`, so that its normal
-        force is not a multiplier; `ShapeError` for another number of multipliers.
+        force is not a multiplier; `ShapeError` if the number of multipliers does not
+        fit the contacts.
         """
         self.check_load(name, None)
         self._check_multipliers(multipliers)
@@ -876,8 +878,9 @@ class Contacts(eqx.Module):
     def check_constraints_of(self, system: Any) -> None:
         """Raise a `ValueError` unless a system has these constraints and no others.
 
-        The multipliers are then in the order of the contacts. With `followed_by`, the
-        holonomic constraints are a function of the user, and are not checked.
+        With these constraints, the multipliers are in the order of the contacts. With
+        `followed_by`, the holonomic constraints are a function of the user, and are not
+        checked.
         """
         names = ("nonholonomic", "holonomic")
         for name in names[:1] if self._num_others else names:
@@ -897,7 +900,7 @@ class Contacts(eqx.Module):
                 )
 
     def __getitem__(self, name: str) -> AbstractContact:
-        """Return the contact of a name."""
+        """Return the contact with this name."""
         if name not in self.names:
             raise ValueError(
                 f"`contact` must be one of {', '.join(map(repr, self.names))}, got "
@@ -963,7 +966,7 @@ class Heights(AbstractOfSystem):
 
 
 def checked_contacts(contacts: Any) -> Contacts:
-    """Return the contacts, or raise a `TypeError` if they are anything else."""
+    """Return the contacts, or raise a `TypeError` if they are not `Contacts`."""
     check_type("contacts", contacts, Contacts, "Make them with rolling.Contacts(...).")
     return contacts
 

@@ -45,7 +45,7 @@ class SystemReport(eqx.Module):
     - `dimension`: the number n of coordinates.
     - `num_nonholonomic`, `num_holonomic`: the numbers m and k of constraints.
     - `mass_condition`, `compatibility_condition`: the condition numbers of M = ∂p/∂v
-        and of C = B M⁻¹ Bᵀ, after their rows and columns are scaled to size one; B is
+        and of C = B M⁻¹ Bᵀ, after a scaling that removes the influence of units; B is
         the Jacobian of the constraints with respect to v. If one of these numbers is
         infinite, the accelerations at the state are not determined.
     - `violations`: the values of the constraint functions by name, "Φ[0]" for
@@ -56,7 +56,7 @@ class SystemReport(eqx.Module):
         `dependent` are then not unique.
     - `depends_on_time`: the names of the functions that depend on t.
     - `ignorable`: the indices of coordinates that no function depends on near the given
-        state. A coordinate whose terms cancel only up to rounding is not found.
+        state. A coordinate is not found if its terms cancel but leave round-off.
     - `constant`: the names of constant matrices, among the mass matrix and the
         Jacobian of the nonholonomic constraints.
     """
@@ -290,7 +290,7 @@ def _derivatives(system, t, q, u, args, near) -> dict[str, Any]:
     by_time, by_position, second = jax.vmap(sample)(*near)
     rows = constraint_rows(t, jnp.zeros_like(u), u)
     # If a constraint is the square of an expression, its row is zero at states that
-    # satisfy the constraint. Rows at nearby states show how small a zero row must be.
+    # satisfy the constraint. The row at nearby states sets the bound for a zero row.
     rows_near = jax.vmap(constraint_rows, (None, 0, 0))(t, *near)
     elsewhere = jnp.max(jnp.abs(rows_near), axis=(0, 2))
     zero = jnp.finfo(u.dtype).eps ** 0.75 * elsewhere

@@ -77,10 +77,10 @@ def linear_stability(
     """Linearise the constrained equations of motion about a steady motion.
 
     A steady motion, or relative equilibrium, is an orbit of a one-parameter group of
-    symmetries of the system. Let x = (q, u), and let ẋ = f(x) be the equations of
-    motion. Their multipliers follow from the time derivatives of the constraints. Let X
-    be the vector field that generates the symmetries. Then f - X vanishes at the state,
-    and
+    symmetries of the system. Let x = (q, u), where u is the velocity or momentum, and
+    let ẋ = f(x) be the equations of motion. Their multipliers follow from the time
+    derivatives of the constraints. Let X be the vector field that generates the
+    symmetries. Then f - X vanishes at the state, and
 
     ż = A z,    A = W D(f - X) Z,
 
@@ -93,7 +93,7 @@ def linear_stability(
     shift the motion in time or space and are excluded, so that A belongs to the reduced
     system. Without `symmetry`, X generates the translation that has the velocity of the
     state: a translation of ignorable coordinates, or a left translation of the group.
-    All velocities (on a group, body velocities), or at least the chosen independent
+    All velocities (on a group, body velocities), or at least the chosen positions and
     velocities, must be constant. For a bicycle on a circle, only some velocities are
     constant: choose these.
 
@@ -195,7 +195,7 @@ def _drift_rates(
     In a steady motion, the chosen coordinates are constant; if none are chosen, all
     velocities are constant. Their first and second time derivatives must vanish. The
     first alone is not enough: for the velocity of a pendulum, it also vanishes at the
-    lowest point. The bounds allow for states that are accurate to a few digits only.
+    lowest point. The bounds allow for states that are accurate to only a few digits.
     """
     dim = linearised.position_jacobian.shape[1]
     if independent is None:

@@ -50,7 +50,7 @@ class Orbit(NamedTuple):
 
     @property
     def coefficients(self) -> Float[Array, " k"]:
-        """Return the c for which the motion is Σ c_k (generator k)."""
+        """Return the c for which Σ c_k (generator k) is closest to the motion."""
         return jnp.linalg.solve(
             self.directions @ self.directions.T, self.directions @ self.motion
         )
@@ -265,8 +265,8 @@ def orthonormal_basis(rows: Array, orbit: Array) -> PermittedPerturbations:
 
     The basis is unique only up to a rotation, and the derivative of a singular value
     decomposition does not exist for equal singular values. Therefore the computed basis
-    counts as constant. The derivative comes only from a correction that keeps the basis
-    in the kernel.
+    is treated as constant, and derivatives come only from a correction that keeps the
+    basis in the kernel.
     """
     rows = jnp.concatenate([rows, orbit])
     count = rows.shape[0]
@@ -342,7 +342,7 @@ class SymmetryConditions(NamedTuple):
     - `on_constraints`: the rates at which generators violate the constraints.
     - `drift`: the motion minus the combination of generators, one entry for each
       component.
-    - `bracket`: the brackets of the motion and the generators.
+    - `bracket`: the brackets of the motion with each generator, and their derivatives.
     - `closed`: the rates at which generators leave their span in the moving frame.
 
     Except for `drift`, the arrays have one row for each generator.
@@ -364,7 +364,7 @@ def check_relative_equilibrium(
 ) -> SymmetryConditions:
     """Compute the residuals that vanish if the motion is an orbit of symmetries.
 
-    The bounds allow for states that are accurate to a few digits only.
+    The bounds allow for states that are accurate to only a few digits.
 
     **Arguments:**
 

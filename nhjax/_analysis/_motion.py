@@ -43,7 +43,7 @@ class Motion(eqx.Module):
         of the holonomic constraints.
     - `is_unique`: whether the equations determine each multiplier, shape (l,). It is
         false for redundant constraints, whose multipliers are the solution with the
-        least norm. The sum `reaction` is always unique.
+        least norm. The total `reaction` is always unique.
 
     The product of a generalised force and its coordinate is work, so that the unit of
     the force is N for a coordinate in m, and N m for an angle. A multiplier is a force
@@ -95,12 +95,13 @@ def motion(
 
     - `system`: the mechanical system.
     - `t`: the time of the state.
-    - `y`: a state, from `initial_state` or `Solution.ys`. If it violates the
-        constraints, the accelerations keep the violation constant.
+    - `y`: a state, from `initial_state` or `Solution.ys`. If its velocity violates
+        constraints, the accelerations keep this violation constant.
     - `args`: passed on to the functions of the system.
 
-    **Returns:** a `Motion`. Its values are not finite if the mass matrix or the
-    compatibility matrix is singular.
+    **Returns:** a `Motion`. Its rates and forces are not finite if the mass matrix is
+    singular, or if the compatibility matrix is singular and the system does not declare
+    its constraints redundant.
 
     **Raises:** `DependentConstraintsError` if constraints are dependent, unless the
     system declares them redundant; under `jit` and `vmap`, accelerations and reactions

@@ -124,8 +124,8 @@ def steady_motion(
     - `t`: the time at which functions of time are evaluated.
     - `y`: a state from which the search starts.
     - `args`: passed on to the functions of the system.
-    - `positions`, `velocities`: the indices that must be steady. Leave out indices that
-        follow from the others: positions that follow from holonomic constraints,
+    - `positions`, `velocities`: the indices that must be steady. Leave out components
+        that follow from the others: positions that follow from holonomic constraints,
         velocities that follow from nonholonomic constraints, and a speed that is
         constant because energy is conserved.
     - `symmetry`: generators of symmetries, as `linear_stability` takes them, in place
@@ -375,8 +375,8 @@ def least_norm_root(
     - `residual`: the function whose root is computed.
     - `free`: 1 for each unknown that may change, and 0 for the others.
     - `start`: the values to which the unknowns are added.
-    - `groups`: the numbers of unknowns of each kind, in order. The round-off of an
-        unknown is proportional to the largest unknown of its kind.
+    - `groups`: the numbers of unknowns of each kind (such as positions), in order. The
+        round-off of an unknown is proportional to the largest unknown of its kind.
     - `max_iterations`: the largest number of iterations.
 
     **Returns:** the root, the residual at the root, and the result of the iteration.
@@ -407,8 +407,8 @@ def least_norm_root(
         return x - inverse @ left, left
 
     x, left = jax.lax.scan(refined, x, length=2)
-    # An increment also vanishes if the free unknowns have no influence, so that the
-    # residual must be checked too. The residual is compared with the sum of the
+    # An increment also vanishes if the free unknowns do not influence the residual, so
+    # that the residual must be checked too. It is compared with the sum of its
     # absolute derivatives, each multiplied by the size of its unknown. An unknown
     # without influence has size zero.
     sizes = jnp.where(

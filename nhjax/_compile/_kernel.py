@@ -19,10 +19,10 @@ T = TypeVar("T")
 class TraceCache:
     """A cache of the traced programs of functions.
 
-    A key contains the function and the kinds of its arguments, but not other values
-    that a function of the user may read. These values may change between two calls of
-    `integrate`. A cache is therefore used only while one run is traced and
-    differentiated.
+    A key contains the function, the types of its array arguments, and its other
+    arguments, but not the globals and closed-over variables that it reads. These may
+    change between two calls of `integrate`. A cache is therefore used only while one
+    run is traced and differentiated.
     """
 
     def __init__(self):

@@ -296,7 +296,7 @@ class _Key:
 
 
 # Values that change during tracing, such as a list in which a function counts its
-# calls, are ignored: otherwise the function would be traced again forever. The owners
+# calls, are ignored: otherwise every call would trace the function again. The owners
 # are stored too, so that their identities are not reused. If there are more entries
 # than _MOST, all entries are removed, and programs that are still used are traced once
 # more.

@@ -38,7 +38,7 @@ def write(path: Path, content: bytes) -> None:
 
 
 def write_if_different(path: Path, content: bytes) -> None:
-    """Write a file if its content differs, else delete a leftover temporary file."""
+    """Write a file if its content differs; otherwise delete a leftover temporary."""
     if path.read_bytes() == content:
         _temporary(path).unlink(missing_ok=True)
     else:
@@ -145,8 +145,8 @@ class Journal:
     Process 0 appends to the journal. Every other process appends to its own part, which
     it locks while it runs. A run begins and ends with a single journal: process 0 first
     appends the parts that an interrupted run has left, and at the end writes the lines
-    of all processes in the order of chunks. `lines` has the lines that this process has
-    written.
+    of all processes in the order of chunks. `lines` contains the lines that this
+    process has written.
     """
 
     def __init__(self, folder: Path, index: int):

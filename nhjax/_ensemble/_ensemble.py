@@ -66,8 +66,8 @@ def ensemble(
 
     - `run`: a function of one member that returns a tree of arrays.
     - `members`: a tree of arrays with the members as leading axis, or a function from
-        the index of a member to the member. JAX traces the function, so that the
-        members need no memory.
+        the index of a member to the member. JAX traces the function, and each chunk
+        creates its members, which saves memory.
     - `num_members`: the number of members, if `members` is a function.
     - `out`: a folder for a Zarr store, to which the values of each chunk are written.
         `xarray.open_zarr` opens the store. If a run is interrupted, the same call
@@ -82,10 +82,10 @@ def ensemble(
         values of a member are large.
     - `devices`: the JAX devices to use, `jax.local_devices()` by default.
     - `fixed_order`: compute statistics in an order that does not depend on the number
-        of devices and processes. Two runs then have bitwise equal statistics if their
-        members have bitwise equal values. This order takes more time, because each
-        device reduces all members of a chunk, and processes wait for each other after
-        each chunk.
+        of devices and processes. Two runs with the same `chunk_size` then have bitwise
+        equal statistics if their members have bitwise equal values. This order takes
+        more time, because each device reduces all members of a chunk, and processes
+        wait for each other after each chunk.
     - `progress_meter`: shows the number of finished members; by default a bar on the
         standard error stream if that is a terminal.
     - `resume`: whether to resume the run of an existing store; if False, an existing

@@ -136,7 +136,7 @@ class PeriodicExchange:
         self._ran, self._since = 0, time.monotonic()
 
     def chunk_done(self) -> None:
-        """Count a chunk, and exchange if it is time."""
+        """Count a chunk, and run the next exchange if it is due."""
         self._left, self._ran = self._left - 1, self._ran + 1
         if not self._has_ended and (self._left == 0 or self._ran == self._until_next):
             self._exchange()

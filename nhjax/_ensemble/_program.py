@@ -1,10 +1,10 @@
 """The job of an ensemble: its members, the programs that run them, and its manifest.
 
 A job is split into chunks of members. One compiled program runs every chunk, spread
-over the devices, and reports which members failed. A second program reduces the values
-of a chunk to statistics, if they are asked for. The manifest and the text of the
-program identify a job. Processes compare both before they run a job together, and a
-store contains both, so that it cannot be resumed by another job.
+over the devices, and reports which members failed. If statistics are requested, a
+second program reduces the values of a chunk. The manifest and the text of the program
+identify a job. Processes compare both before they run a job together, and a store
+contains both, so that it cannot be resumed by another job.
 """
 
 import hashlib
@@ -49,8 +49,8 @@ class Layout(NamedTuple):
 class ChunkResult(NamedTuple):
     """The result of a chunk: codes of `RESULTS`, failed steps, and its content.
 
-    The content is the values of all members, or those of their arrays that reductions
-    use, or the states of reductions.
+    The content is the values of all members, or only the arrays of these values that
+    reductions use, or the states of reductions.
     """
 
     codes: Int[Array, " c"]
@@ -307,7 +307,7 @@ def _values_of_chunk(
 def used_arrays(reductions: Any, shapes: Any) -> tuple[bool, ...]:
     """Return which arrays of a value the reductions use.
 
-    Arrays that are not used need not be stored, and XLA may not even compute them.
+    The other arrays need not be stored, and XLA can omit their computation.
     """
     values = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct((1, *x.shape), x.dtype), shapes
@@ -377,8 +377,8 @@ def _reduced(
 def merged_states(reductions: Any, one: Any, other: Any) -> Any:
     """Merge the states of reductions of two sets of members.
 
-    This is a separate program, so that the rounding is the same for states from all
-    sources.
+    This is a separate program, so that the rounding is the same whether a state comes
+    from this process, another process or a file.
     """
     return each_reduction(_merge, reductions, one, other)
 
@@ -486,7 +486,7 @@ def _is_result(x: Any) -> bool:
 def manifest(job: Job, **others: Any) -> dict[str, Any]:
     """Describe the parameters of a job as JSON.
 
-    `others` are further parameters, which depend on the kind of results that are kept.
+    `others` are further parameters, which describe the values or the reductions.
     """
     return {
         "format": FORMAT,

@@ -59,7 +59,7 @@ class Mean(AbstractReduction):
     """The mean over the members of an ensemble, for every number that `run` returns.
 
     mean = (1/n) Σ x_j. The sums are double-double numbers (Hida, Li, Bailey, 2001), so
-    that the result has one rounding error for any size of the chunks.
+    that for any chunk size there are two rounding errors: of the sum and the quotient.
 
     **Arguments:**
 
@@ -188,7 +188,7 @@ class Variance(AbstractReduction):
 class _AbstractExtreme(AbstractReduction):
     """The smallest or the largest of the values of members, chosen by `best`.
 
-    The comparison starts with `worst`, which is not better than any value.
+    The comparison starts with `worst`, the worst possible value.
     """
 
     worst: eqx.AbstractClassVar[float]
@@ -535,7 +535,7 @@ def _double_vectors(tree: Any) -> list["DoubleDouble"]:
 
 
 def _as_doubles(vectors: list["DoubleDouble"], tree: Any) -> Any:
-    """Return the numbers in vectors that `_double_vectors` has made from this tree."""
+    """Undo `_double_vectors`: return a tree like `tree` with the numbers in vectors."""
     place = {x.high.dtype: (x, 0) for x in vectors}
 
     def part(like: DoubleDouble) -> DoubleDouble:

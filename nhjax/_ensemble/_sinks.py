@@ -324,7 +324,8 @@ class ReductionSink(AbstractSink):
 
     def _merge(self, state: Any, failures: FailureList) -> None:
         state = self._placed(state)
-        # Merging the first state would only change its dtypes, but compile a program.
+        # Merging the first state with `neutral` can only change dtypes. If the dtypes
+        # agree, the merge is skipped, because it would compile a program.
         if self.state is not self.neutral or _dtypes(state) != _dtypes(self.neutral):
             state = merged_states(self.reductions, self.state, state)
         self.state = state

@@ -205,7 +205,7 @@ class ZarrSink(AbstractSink):
         content |= {self.PROGRAM: self.program.encode(), self.JOURNAL: b""}
         for name, data in content.items():
             durable.write(unfinished / name, data)
-        # When the store is complete, it gets its final name in one operation.
+        # Once its first files are written, the store gets its final name atomically.
         os.replace(unfinished, self.path)
         durable.sync_folder(self.path.parent)
 
@@ -340,7 +340,7 @@ class CheckpointedReductionSink(AbstractSink):
 
     def _open(self, resume: bool) -> None:
         """Create the folder, or open it and read the state."""
-        # If a run is interrupted before its first chunk, it leaves only these files.
+        # If a run is interrupted before it writes its manifest, it leaves only these.
         early = {
             self.LOCK,
             self.PROGRAM,
@@ -390,7 +390,7 @@ def _check_resumable(
 ) -> None:
     """Raise unless a run may be resumed and its folder has these files.
 
-    `where` names the folder, and `maker` the call that creates folders of its kind.
+    `where` names the folder, and `maker` the call that should have created it.
     """
     if not resume:
         raise FileExistsError(

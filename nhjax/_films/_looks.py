@@ -130,7 +130,7 @@ def link(length: float, radius: float, color: str = GREY) -> str:
 
 
 def ring(radius: float, tube: float, color: str = DARK, num: int = 40) -> str:
-    """Return a torus with its axle along y, made of round bars."""
+    """Return a torus with its axis along y, made of round bars."""
     angles = 2 * np.pi * np.arange(num + 1) / num
     rim = radius * np.stack([np.cos(angles), 0 * angles, np.sin(angles)], axis=1)
     return "".join(rod(a.tolist(), b.tolist(), tube, color) for a, b in pairwise(rim))

@@ -51,13 +51,13 @@ def render(
     - `path`: the file to write: `.mp4` (H.264), `.gif`, or `.png` for a picture.
     - `camera`: `"follow"` moves with the machine; `"fixed"` shows the whole motion; the
         name of a camera of the model; or a dictionary with some of `"azimuth"` and
-        `"elevation"` [degrees], `"distance"` and the point `"lookat"` [m]. A camera
-        without `"lookat"` follows the machine.
+        `"elevation"` [degrees], `"distance"` and the point `"lookat"` [m]. If a
+        dictionary has no `"lookat"`, the camera follows the machine.
     - `fps`: the number of frames in a second of the film.
     - `speed`: the number of seconds of the motion in a second of the film.
     - `size`: the width and the height in pixels; both must be even for `.mp4`.
-    - `t`: the time of the picture, only for `.png`. The default is the last time of the
-        run.
+    - `t`: the time of the picture, only for `.png`. The default is the time of the last
+        frame of the film.
     - `trail`: whether to draw the paths of contact points, or the `trails` of a
         `Looks`.
 
@@ -298,7 +298,7 @@ def _write_mp4(
     command = [
         *(encoder.get_ffmpeg_exe(), "-y", "-loglevel", "error", "-f", "rawvideo"),
         *("-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps}", "-i", "-"),
-        # Many players and browsers can only show this pixel format.
+        # Many players and browsers can show only this pixel format.
         *("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "23"),
         *("-movflags", "+faststart", str(path)),
     ]

@@ -32,7 +32,7 @@ def check_solution(who: str, sol: Any) -> None:
 
 
 def frame_times(who: str, sol: Solution, spacing: float) -> np.ndarray:
-    """Return the times of the frames: from the first saved time on, equally spaced."""
+    """Return the times of the frames, equally spaced from the start of the output."""
     if sol.interpolation is None:
         saved, _ = _rows(who, sol)
         first, last = float(saved[0]), float(saved[-1])
@@ -126,9 +126,10 @@ def _between_rows(
     return interpolate(*at, share)
 
 
-# For two saved states, the travel is the step times the mean of their velocities. The
-# defect is the displacement minus the travel, relative to the travel. A harmonic motion
-# with four saved states in a period has the defect tan(π/4) / (π/4) - 1 = 0.27.
+# The travel between two saved states is the mean of their velocities times the time
+# between them. The defect is the displacement minus the travel, relative to the travel.
+# A harmonic motion with four saved states in a period has the defect
+# tan(π/4) / (π/4) - 1 = 0.27.
 _LARGEST_DEFECT = 0.25
 
 

@@ -137,7 +137,7 @@ class Scene:
         mujoco, data = self._mujoco, self._mujoco.MjData(model)
         solid = model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE
         # The fixed geoms of a `Looks` belong to the machine. The fixed geoms of a robot
-        # are its world, which can be large.
+        # are its world, which can be large and is left out.
         moving = solid & ((model.geom_bodyid > 0) | (self.looks is not None))
         moving = moving if np.any(moving) else solid
         mass = model.body_mass[1:]
@@ -158,7 +158,7 @@ class Scene:
         low, high = (places - radii[:, None]), (places + radii[:, None])
         box = (np.min(low, axis=(0, 1)), np.max(high, axis=(0, 1)))
         self.whole = (box[0] + box[1]) / 2
-        # If a machine stays in place, a camera that follows it would only shake.
+        # If a machine moves little, a camera that follows it would only shake.
         steady = np.where(span < size, np.mean(middles, axis=0), middles)
         self.centres = _smoothed(steady, self.times)
         self.places, self.radii = places, radii
@@ -169,7 +169,10 @@ class Scene:
         return float(np.max(away + self.radii, initial=0.0)) or 1.0
 
     def _furnished(self, subject: Subject) -> tuple[Any, int | None]:
-        """Compile the model, with ground, light and sky added if they are missing."""
+        """Return the compiled model, and the index of its added light or None.
+
+        Ground, light and sky are added to an `MjSpec` that lacks them.
+        """
         mujoco = self._mujoco
         if not isinstance(subject.spec, mujoco.MjSpec):
             # Return a copy, because the renderer writes the size of its pictures into

@@ -74,7 +74,7 @@ class Show:
             self.server.stop()
 
     def wait(self) -> None:
-        """Wait until the user interrupts with Ctrl-C, and stop."""
+        """Wait until the user presses Ctrl-C, and then call `stop`."""
         try:
             while not self._stopped.wait(1.0):
                 pass

@@ -33,14 +33,14 @@ class Found(NamedTuple):
     """A computed initial state, and the numbers that the checks need.
 
     - `lin`: the linearisation of the equations of motion at the state.
-    - `off_group`: the distance of the given q to the group.
+    - `off_group`: the distance to the group of the given q, or of the projected q.
     - `regularity`, `compatibility`: the reciprocal condition numbers of the metric on
         the fibre and of the compatibility matrix.
     - `ranks`, `deficient`: the constraint derivatives whose rank is checked, and
         whether each lacks full rank. For redundant constraints, the rank is deficient
         only if a row is zero.
     - `allowed`, `allowed_positions`, `allowed_off_group`: the bounds on violations.
-    - `legendre_solved`: whether the Legendre transform was inverted.
+    - `legendre_solved`: whether the Legendre transform was inverted, if needed.
     - `projected`: whether the projection onto the constraints has converged.
     - `fixed_positions`, `fixed_velocities`: the combinations of constraints that kept
         components determine; None if no components are kept.

@@ -320,7 +320,7 @@ def _project(
 def _noise(
     system, lin: Linearisation, t, q, u, args
 ) -> tuple[FunctionNoise, Float[Array, "l n"]]:
-    """Measure round-off, and set rows of D2Φ that are only round-off to exact zeros.
+    """Measure round-off, and replace rows of D2Φ that are only round-off by zeros.
 
     A constraint that is the square of an expression has such a row at states that
     satisfy the constraint. The round-off of a row is measured along one direction,

@@ -225,10 +225,10 @@ Vector = Float[Array, " n"]
 class Fixed(NamedTuple):
     """The combinations of constraints that the kept components determine.
 
-    Each constraint is divided by the size of its derivatives. The rows of `projector`
-    and `slopes` belong to the constraints.
+    Each constraint is divided by its largest absolute derivative. The rows of
+    `projector` and `slopes` belong to the constraints.
 
-    - `sizes`: the sizes of the derivatives of the constraints.
+    - `sizes`: the largest absolute derivative of each constraint, 1 if all are zero.
     - `projector`: the projector onto the combinations that are constant, to first
         order, when only the components that are not kept change.
     - `slopes`: the derivatives of the constraints along the kept components.
@@ -284,7 +284,7 @@ def project_position(system, t, q, u, args, kept: Kept, given: PyTree[Array]):
     nearest = _nearest_keeping(mass, gamma, held, zero, sizes, terms, is_redundant)
     # A condition such as w = 1 on a unit quaternion has zero derivative where it holds.
     # A search that starts there leaves the condition out of its equations, and can
-    # converge to a point that violates the condition.
+    # converge to a point that violates it. Therefore the kept numbers are checked.
     moved = manifold.act(q, nearest.x)
     size = max_norm(*jax.tree.leaves(stop_gradient((q, moved))))
     off = max_norm(stop_gradient(held(nearest.x)))
@@ -437,7 +437,7 @@ def _nearest(
         terms of the constraint. The round-off of y and of the constraint is
         proportional to these sizes.
     - `is_redundant`: whether constraints may be dependent.
-    - `idle`: one for rows of the constraint that are zero everywhere, and zero for the
+    - `idle`: 1 for rows of the constraint that are zero everywhere, and 0 for the
         others. The multipliers of idle rows are zero.
     """
     jacobian = jax.jacrev(constraint)(x)

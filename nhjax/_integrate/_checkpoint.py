@@ -192,8 +192,8 @@ def resumed(y0: Checkpoint, fresh: StepState) -> StepState:
 
     `fresh` is the step state of a run from `y0.state`. The linearisation of `fresh`
     replaces the linearisation of the checkpoint if the matrices of the two differ by
-    more than eps^(1/4), relative to their sizes. This happens if the run continues with
-    another system or other args.
+    more than eps^(1/4), relative to their sizes. This can happen if the run continues
+    with another system or other args.
     """
     new, structure = jax.tree.flatten(fresh.lin)
     _check_arrays("linearisation", y0.linearisation, new)

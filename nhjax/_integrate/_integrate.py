@@ -186,7 +186,7 @@ def integrate(
     - `t1`: the end of the run, in place of `num_steps`. The last step ends exactly at
         this time.
     - `args`: passed on to the functions of the system. Arrays and floats in it are
-        traced, so that other values do not recompile. All other values are static.
+        traced, so that changing them does not recompile. All other values are static.
 
     **Other arguments:**
 
@@ -197,11 +197,11 @@ def integrate(
         equal to `dt`. `nhjax.PIDController(rtol, atol)` keeps an estimated error below
         a tolerance. A third choice is `nhjax.ReversibleController(eps, density)`.
         Derivatives treat the sizes that a controller chooses as constants.
-    - `max_steps`: the largest number of attempts at a step in a run to `t1`, an int.
-        The default is 4096, or the number of steps that the run needs if the steps are
-        constant and this number is known when tracing. Under `jit`,
-        `SaveAt(steps=..., ts=..., dense=...)` and reverse mode need memory for
-        `max_steps` steps.
+    - `max_steps`: the largest number of attempts at a step, an int; only for runs to
+        `t1` or with a controller. The default is the number of steps, if it is known
+        when tracing and no step can be repeated; otherwise 4096, or 4 `num_steps` if
+        this is larger. Under `jit`, the memory for `SaveAt(steps=..., ts=...,
+        dense=...)` and for reverse mode grows with `max_steps`.
     - `adjoint`: which data reverse mode stores: `nhjax.DirectAdjoint()` by default,
         `nhjax.RecursiveCheckpointAdjoint()`, or `nhjax.ReversibleAdjoint()`.
     - `throw`: whether to raise an error if a step cannot be solved. If false, the
@@ -230,19 +230,19 @@ def integrate(
 
     !!! note
 
-        Outside of JAX transformations, the host calls a compiled program that takes a
-        chunk of steps. Changing `num_steps`, `SaveAt(steps=k)`, `adjoint` or
-        `progress_meter` does not recompile it. The first run with `ts` or `dense`
-        compiles programs that also store the stage values from which the output between
-        steps is computed. Ctrl-C ends a run after the current chunk, within about a
-        fifth of a second: `integrate` warns and returns the solution up to the end of
-        this chunk, with the `result` `nhjax.RESULTS.interrupted`.
+        Outside of JAX transformations, the host repeatedly calls a compiled program,
+        which takes one chunk of steps. Changing `num_steps`, `SaveAt(steps=k)`,
+        `adjoint` or `progress_meter` does not recompile it. The first run with `ts` or
+        `dense` compiles programs that also store the stage values from which the output
+        between steps is computed. Ctrl-C ends a run after the current chunk, within
+        about a fifth of a second: `integrate` warns and returns the solution up to the
+        end of this chunk, with the `result` `nhjax.RESULTS.interrupted`.
 
         Under `jit` an int `num_steps` is static. An integer array is traced, and under
-        `vmap` each member may have its own number of steps. With an array, `saveat`
-        must not have `steps`, `ts` or `dense`, because the shape of their output
-        depends on the number of steps. Reverse mode needs an int, or
-        `ReversibleAdjoint`.
+        `vmap` each member may have its own number of steps. With an array, all steps
+        must have the size `dt`, a `progress_meter` is not possible, and `saveat` must
+        not have `steps`, `ts` or `dense`, because the shape of their output depends on
+        the number of steps. Reverse mode needs an int, or `ReversibleAdjoint`.
 
     !!! note
 
@@ -397,8 +397,8 @@ def step(
     - `args`: passed on to the functions of the system, for instance controls that are
         constant during the step.
     - `stage_solver`: `nhjax.SimplifiedNewton()` by default, or `nhjax.Newton()`.
-    - `throw`: raise an error if the step cannot be solved. Otherwise all numbers of the
-        returned state are NaN.
+    - `throw`: whether to raise an error if the step cannot be solved. If false, all
+        numbers of the returned state are then NaN.
     - `invariants`: quantities that the step conserves, as for `nhjax.integrate`.
 
     **Returns:** the `State` at `t + dt`.
@@ -450,11 +450,11 @@ def suggest_step(
 ) -> float:
     """Suggest a step size for runs with constant steps, from a trial run.
 
-    The trial run from `t0` to `t1` takes steps by `nhjax.PIDController(rtol, atol)`.
-    The suggestion is the smallest size of these steps. The first steps, in which the
-    controller still searches for a suitable size, and the last step, which must end at
-    `t1`, are left out. The size is then rounded down, so that a whole number of steps
-    leads from `t0` to `t1`. Constant steps of this size have errors within the
+    In the trial run from `t0` to `t1`, `nhjax.PIDController(rtol, atol)` chooses the
+    step sizes. The suggestion is the smallest of these sizes. The first steps, in which
+    the controller still searches for a suitable size, and the last step, which must end
+    at `t1`, are left out. The size is then rounded down, so that a whole number of
+    steps leads from `t0` to `t1`. Constant steps of this size have errors within the
     tolerance in the fastest phase of the motion, and smaller errors elsewhere.
 
     **Arguments:**
@@ -700,7 +700,7 @@ def _countable(num_steps: int | IntScalar) -> list[Check]:
 
 def _advancing(t0: FloatScalar, dt: FloatScalar) -> Check:
     """Return the check that t0 + dt differs from t0, so that time advances."""
-    # Concrete values are compared on the host with NumPy, which is ten times faster.
+    # Concrete values are compared with NumPy, which is ten times faster than JAX.
     numpy: Any = jnp if is_traced(t0, dt) else np
     first, h = numpy.asarray(t0), numpy.asarray(dt)
     # Infinite numbers are checked separately.

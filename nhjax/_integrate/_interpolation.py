@@ -169,7 +169,7 @@ def step_position(
 ) -> tuple[Float[Array, "*k"], Bool[Array, "*k"]]:
     """Return times in units of steps, and which of the times lie in the run.
 
-    Times outside of the run by round-off count as inside.
+    Times that lie outside of the run only by round-off count as inside.
     """
     position = (t - t0) / dt
     # Times have rounding errors that are proportional to the largest time.

@@ -26,9 +26,9 @@ from ._stepper import AbstractCarry, AbstractStepper, StepResult
 class Loop(eqx.Module):
     """The time loop of a run: its stepper, its output, and its progress meter.
 
-    An adjoint calls `step` for k = 0, ..., num_iterations - 1 in order. After each
-    iteration it calls `write` to put the returned rows into buffers, which start as
-    `empty_rows`.
+    An adjoint calls `step` for k = 0, ..., num_iterations - 1 in order, or until the
+    run ends. After each iteration it calls `write` to put the returned rows into
+    buffers, which start as `empty_rows`.
     """
 
     stepper: AbstractStepper[Any, Any]
@@ -63,7 +63,7 @@ class Loop(eqx.Module):
 
         A stepper may need more iterations than there are steps. The report assumes the
         largest number of iterations, so that all members of a batch report the same
-        number of steps, and the meter is called once for all.
+        number of steps, and the meter is called once for all members.
         """
         length = static_length(self.stepper.plain.num_steps)
         surplus = static_length(self.num_iterations) - length
@@ -103,9 +103,9 @@ class Loop(eqx.Module):
         return jax.eval_shape(rows)
 
     def moving(self, carry: AbstractCarry) -> AbstractCarry:
-        """Return the same carry, with tangents if the run is differentiated.
+        """Return the same carry, whose state has tangents if the run is differentiated.
 
-        Only the state has tangents, which may be zero.
+        These tangents may be zero.
         """
         state = with_zero_tangents(carry.step_state.state, self.stepper)
         return eqx.tree_at(lambda x: x.step_state.state, carry, state)

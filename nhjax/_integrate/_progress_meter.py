@@ -30,10 +30,10 @@ class AbstractProgressMeter(eqx.Module):
         """
 
     def update_part(self, percent: int) -> None:
-        """Show the percentage of the run's time that is done.
+        """Show the percentage of the run that is done.
 
-        If the number of steps is not known, the loop calls this method each time the
-        percentage has increased.
+        In a run with variable steps, the loop calls this method, not `update`, each
+        time the percentage has increased.
         """
         self.update(percent, 100)
 

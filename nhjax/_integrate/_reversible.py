@@ -23,12 +23,13 @@ class ReversibleAdjoint(AbstractAdjoint):
 
     If the method is symmetric, a step of -h leads back to the start of a step of h.
     There are two exceptions, in which a step of -h leads back only up to a small error:
-    the consistent closure, and on a group the chart at the start of a step. Then an
-    iteration that starts from the step of -h inverts the step.
+    the consistent closure, and on a group the chart at the start of a step. In these
+    cases, and if the method is not symmetric, the step is inverted by an iteration that
+    starts from the step of -h.
 
     The retraced states differ from the states of the run by round-off. If a set
-    attracts the motion, as for a sleigh, this set repels the motion in reversed time,
-    and these differences grow as fast as the motion decays. In that case prefer
+    attracts the motion, as for a sleigh, it repels the motion in reversed time, and
+    these differences grow as fast as the motion approached the set. In that case prefer
     `RecursiveCheckpointAdjoint`. This adjoint allows only reverse mode and forward over
     reverse mode: `jax.jvp` needs one of the other two adjoints. Gradients are also
     available if `num_steps` is an array.
@@ -63,7 +64,7 @@ def _run_fwd(perturbed, arguments):
     # `_run` is not called here: it has a custom rule for reverse mode, which forward
     # mode cannot differentiate.
     carry, rows = DirectAdjoint().run(*arguments)
-    # The backward pass needs only the shapes of the buffers, and the log.
+    # The backward pass needs only the log, and the shapes of all buffers.
     shapes = jax.eval_shape(lambda: rows)
     return (carry, rows), (carry, shapes, rows.log)
 

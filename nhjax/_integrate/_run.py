@@ -97,9 +97,9 @@ from ._variable import StepSizes, VariableStepper
 class RunOptions(eqx.Module):
     """The user's options that contain functions.
 
-    `fn` is the function of `SaveAt`. `invariants` is the argument of `integrate`,
-    `events` is its argument `event` as a tuple, and `controller` is its argument
-    `stepsize_controller`, or None for a run with constant steps.
+    `fn` is the function of `SaveAt`. `invariants` is the argument of `integrate`, and
+    `events` is its argument `event` as a tuple. `controller` chooses the step sizes; it
+    is None in a run of `num_steps` constant steps.
     """
 
     fn: Callable[[Any, Any, Any], PyTree[Array]]
@@ -231,7 +231,7 @@ def _sizes(
     plain: PlainStepper,
     y: State,
 ) -> StepSizes:
-    """Return the sizes of the steps of a run."""
+    """Return how a run chooses the sizes of its steps."""
     assert controller is not None
     controller = controller.closure_converted(plain.system, grid.t0, y, plain.args)
     given = grid.dt, grid.t1, grid.direction, grid.num_steps, grid.max_steps
@@ -245,7 +245,7 @@ class _Start(NamedTuple):
     - `noise`: the round-off of the functions of the system.
     - `saved`: the output of the initial state, if it is asked for.
     - `surplus`: the number of iterations that the run may need in addition to one for
-        each step; in a run with variable steps, the number of all iterations.
+        each step; in a run with variable steps, the largest number of iterations.
     - `room`: the number of rows of the buffers of a chunk.
     """
 
@@ -501,7 +501,7 @@ def run_in_chunks(
     if saveat.saves_end(output.num_steps):
         pieces.append(_one(on_host(last.saved_end)))
     if not pieces and saveat.saves_rows:
-        # A run with variable steps may have fewer steps than the stride of its output.
+        # A run with variable steps may end before the first step that is saved.
         pieces.append(jax.tree.map(lambda x: x[:0], _one(on_host(start.saved))))
     ts, ys = on_device(joined(pieces), last.end.t) if pieces else (None, None)
     interpolation, result = None, last.carry.result
@@ -536,7 +536,7 @@ def run_in_chunks(
 def _steps_taken(
     saveat: SaveAt, t0: FloatScalar, t1: FloatScalar, records: StepRecord | None
 ) -> tuple[SaveAt, np.ndarray]:
-    """Find the steps in which the times of `SaveAt(ts=...)` lie, after the run.
+    """Find, after the run, the steps in which the times of `SaveAt(ts=...)` lie.
 
     Return options that contain only the times that were reached, and the indices of the
     steps.
@@ -718,7 +718,7 @@ def _padded_output(
 
 
 def _infinite_unless(valid: Bool[Array, " k"], saved: PyTree[Array]) -> PyTree[Array]:
-    """Return the entries, with infinity in place of entries that are not valid."""
+    """Replace entries that are not valid by infinity, except in arrays of integers."""
 
     def fill(x: Array) -> Array:
         if not jnp.issubdtype(x.dtype, jnp.inexact):

@@ -27,7 +27,7 @@ def save_state(t: FloatScalar, y: State, args: Any) -> State:
 class SaveAt(eqx.Module):
     """Options for the output of `integrate`: which states of a run are saved.
 
-    The options have the same meanings as the options of `diffrax.SaveAt`.
+    Except for `checkpoint`, the options mean the same as in `diffrax.SaveAt`.
 
     **Arguments:**
 
@@ -318,7 +318,10 @@ class Saving(eqx.Module):
     def row_of_state(
         self, t: FloatScalar, y: State, args: Args, k: Int[Array, ""]
     ) -> PyTree[Array] | None:
-        """Compute the saved data of row k for the state y at t, if there are any."""
+        """Compute the entry for the state y at t, the state after step k.
+
+        The entry is zero if this step is not saved, and None if no step is saved.
+        """
 
         def save():
             return self.saved(t, y, args)
@@ -406,7 +409,7 @@ class Saving(eqx.Module):
     def read(
         self, buffers: Rows, k: Int[Array, ""], log_slot: Int[Array, ""] | None = None
     ) -> Rows:
-        """Read output row k and an entry of the log, where `write` stored them."""
+        """Read row k and an entry of the log from where `write` stored them."""
 
         def get(buffer, slot):
             return jax.tree.map(lambda x: x[slot], buffer)

@@ -28,8 +28,8 @@ class EventLog(eqx.Module):
     """The events of a run in order of time: the field `events` of a `Solution`.
 
     - `num`: the number of events.
-    - `ts`: the times of the events, of shape (e,), where e is the largest number of
-        events that the arguments `max_events` of all events allow.
+    - `ts`: the times of the events, of shape (e,), where e is the sum of the
+        `max_events` of all events, or 1 if every event ends the run.
     - `which`: for each entry, the index of the event in the argument `event`.
     - `before`, `after`: the states at the events before and after their resets, each a
         `State` with a leading axis of length e.
@@ -92,9 +92,9 @@ class Solution(eqx.Module):
         this event, and with constant steps all later entries of `ts` and `ys` repeat
         the time and the state of the event.
 
-    With variable steps, the output of a call outside of transformations has exactly the
-    steps that were taken. Under `jit` the output has entries for the largest possible
-    number of steps, and entries that are not used are infinite.
+    With variable steps, the output of a call outside of transformations has entries
+    only for the steps that were taken. Under `jit` the output has entries for the
+    largest possible number of steps, and entries that are not used are infinite.
 
     Under `vmap` every array has a leading axis for the members of the batch.
     """
@@ -115,9 +115,10 @@ class Solution(eqx.Module):
     def evaluate(self, t: FloatScalarLike) -> State:
         """Compute the state at any time of the run, by the collocation polynomials.
 
-        The configuration q(t) is the paper's continuous polynomial u(t), and the
-        momentum p(t) is the mixed polynomial v(t) of its Proposition on continuous
-        approximation. The velocity v(t) follows from p(t) by the Legendre transform.
+        The configuration q(t) is the paper's continuous polynomial (there u(t)), and
+        the momentum p(t) is the mixed polynomial (there v(t)) of its Proposition on
+        continuous approximation. The velocity v(t) follows from p(t) by the Legendre
+        transform.
         The multiplier λ(t) is the continuous multiplier at that state; with the
         propagated closure it is the polynomial through the stage multipliers Λ^i.
         At the ends of the steps the result is the state that `integrate` computed.

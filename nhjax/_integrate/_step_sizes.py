@@ -56,8 +56,8 @@ class StepContext(NamedTuple):
 class Attempt(NamedTuple):
     """A step that was tried: from the time t, of size h, with its outcome.
 
-    - `chosen`: the size that the controller chose. The size h is smaller if the run
-        ends in the step, and for the parts of a step before and after an event.
+    - `chosen`: the size that the controller chose. The size h may differ from it in
+        the last step of a run, and in the parts of a step before and after an event.
     - `is_solved`: whether the equations of the step were solved.
     - `is_whole`: whether the step ends where a step of the size `chosen` would end.
         Otherwise it ends earlier, at the end of the run.
@@ -278,9 +278,9 @@ class PIDController(AbstractStepSizeController):
     - `pcoeff`, `icoeff`, `dcoeff`: the coefficients of the controller. With the default
         coefficients, the next size depends on e_n and r_n only.
     - `dtmin`, `dtmax`: the smallest and the largest size of a step, in units of time,
-        both positive. A run that needs smaller steps fails. The last step of a run
-        and steps to events may be smaller.
-    - `factormin`, `factormax`: the limits of the change of size from step to step.
+        both positive. A run that needs steps smaller than `dtmin` fails. The last
+        step of a run and steps to events may be smaller.
+    - `factormin`, `factormax`: the limits of the ratio h_{n+1} / h_n.
     - `safety`: a factor below 1, which makes rejections rare.
 
     **Raises:** `ValueError` if a number is outside of its range.
@@ -385,7 +385,7 @@ class PIDController(AbstractStepSizeController):
     def init(
         self, context: StepContext, t: FloatScalar, start: StepState
     ) -> tuple[FloatScalar, Memory, RESULTS]:
-        """Return `dt` or, if None, a size that changes the state by one percent."""
+        """Return `dt` or, if None, a size in which the state changes by one percent."""
         # Before the first step there are no earlier errors, sizes and growth rates. The
         # logarithms of the errors start as zero. The size starts as zero, so that no
         # trend is predicted. The growth rates start as infinite, which means unknown.
@@ -483,9 +483,9 @@ class PIDController(AbstractStepSizeController):
         error = jnp.maximum(error, bound)
         powers = (p + i + d) * error - (p + 2 * d) * last + d * before_last
         factor = -powers / number
-        # If errors grow, the next size is reduced in advance. Otherwise a quarter of
-        # the steps of an orbit with close passes were rejected. An earlier error below
-        # 0.01 counts as 0.01, because it may be small by chance.
+        # If errors grow, the next size is reduced in advance. Without this reduction, a
+        # quarter of the steps of an orbit with close passes were rejected. An earlier
+        # error below 0.01 counts as 0.01, because it may be small by chance.
         growth = jnp.maximum(last, math.log(0.01)) - error
         change = jnp.log(size / jnp.where(last_size > 0, last_size, size))
         trend = change + growth / number
@@ -669,7 +669,7 @@ class ReversibleController(AbstractStepSizeController):
     def _size(
         self, context: StepContext, density: FloatScalar, rate: FloatScalar
     ) -> FloatScalar:
-        """Compute the size of the step after a node, given its density."""
+        """Compute the size of the step after a node, from the density and its rate."""
         eps = jnp.asarray(self.eps, density.dtype) * context.direction
         return eps / (density + 0.5 * eps * rate)
 

@@ -219,7 +219,10 @@ class AbstractReverseReplay(eqx.Module, Generic[C, R]):
 
 
 class PlainCarry(AbstractCarry):
-    """The carry of a run without events. Derivatives pass only through the state."""
+    """The carry of a run with constant steps and without events.
+
+    Derivatives pass only through the state.
+    """
 
     step_state: StepState
     result: RESULTS
@@ -298,7 +301,7 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
             RESULTS.inconsistent_start,
         )
         if y0.multiplier.shape[0] > 1:
-            # The start is checked only with several constraints. With a single
+            # This check is made only with several constraints. With a single
             # constraint, the first step itself detects a singular matrix.
             result = RESULTS.where(
                 (result == RESULTS.successful) & ~step_state.lin.determines_multipliers,
@@ -409,7 +412,10 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
 
 
 class PlainReverseReplay(AbstractReverseReplay[PlainCarry, None]):
-    """The replay of a run without events: the index of a step gives its start time."""
+    """The replay of a run with constant steps and without events.
+
+    The index of a step gives its start time.
+    """
 
     stepper: PlainStepper
     start: PlainCarry

@@ -87,8 +87,8 @@ class AbstractLieGroup(eqx.Module):
         """Return the element of the group nearest to `q`."""
         return q
 
-    # A user's group may omit the two methods below. The library does not call them, and
-    # they do not follow from the other methods.
+    # A user's group may omit the two methods below. The integrators do not call them,
+    # and they do not follow from the other methods.
 
     def matrix(self, g: Element) -> Float[Array, "k k"]:
         """Return the matrix that represents the element g."""
@@ -114,8 +114,8 @@ class AbstractLieGroup(eqx.Module):
         """Return `q` with its angles reduced to one turn.
 
         The functions of a system are called with this element. An angle that has grown
-        over many turns is replaced by the equivalent angle of the first turn plus the
-        compensation, because a smaller number has a smaller rounding error.
+        over many turns is replaced by the equivalent angle between -π and π, plus
+        the compensation, because a smaller number has a smaller rounding error.
         """
         return q
 
@@ -133,7 +133,7 @@ class AbstractLieGroup(eqx.Module):
     def advance_across(
         self, q: Element, xi: Vector, compensation: Element
     ) -> tuple[Element, Element]:
-        """Advance from -ξ to ξ in the chart, to g τ(-ξ)⁻¹ τ(ξ), as `advance` does."""
+        """Compute g τ(-ξ)⁻¹ τ(ξ), from -ξ to ξ in the chart, and its compensation."""
         return self.advance(self.act_back(q, -xi), xi, compensation)
 
     def tangent(self, g: Element, eta: Vector) -> Element:

@@ -38,9 +38,9 @@ class SO2(AbstractLieGroup):
 
     The velocity is ω = dθ/dt. The angle is an array of shape (1,), like an element of
     `Euclidean(1)`. It is never wrapped to one turn, so that it counts the turns. Inside
-    a step, however, the functions of the system receive the equivalent angle of the
-    first turn, whose sine and cosine lose no digits after many turns. These functions
-    must therefore have the period 2π.
+    a step, however, the functions of the system receive the equivalent angle between -π
+    and π, whose sine and cosine lose no digits after many turns. These functions must
+    therefore have the period 2π.
 
     Otherwise, the group with `Exponential()` is the same as `Euclidean(1)`. With
     `Cayley()` the retraction rotates by 2 arctan(ω/2).

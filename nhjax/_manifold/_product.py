@@ -115,7 +115,7 @@ class ProductGroup(AbstractLieGroup):
         return self._tuple(lambda group, g: group.no_compensation(g), q)
 
     def wrapped(self, q: Element, compensation: Element) -> Element:
-        """Wrap the part of every factor."""
+        """Return `q` with the angles of every factor reduced to one turn."""
         return self._tuple(lambda group, *of: group.wrapped(*of), q, compensation)
 
     def advance(

@@ -56,7 +56,7 @@ class AbstractRetraction(eqx.Module):
     def rotation_vector(
         self, w: FloatScalar, v: Float[Array, "3"]
     ) -> Float[Array, "3"]:
-        """Compute the shortest ω for which τ(ω) is the rotation of the quaternion."""
+        """Compute the shortest ω for which τ(ω) is the rotation of (w, v)."""
 
     @abstractmethod
     def dtau_coefficients(
@@ -72,14 +72,15 @@ class AbstractRetraction(eqx.Module):
 
     @abstractmethod
     def in_chart(self, s: FloatScalar) -> BoolScalar:
-        """Return whether τ is invertible at the rotation, with a margin."""
+        """Return whether τ is invertible where |ω|² = s, with a margin."""
 
 
 class Cayley(AbstractRetraction):
     """The Cayley map τ(ξ) = (I - ξ^/2)⁻¹ (I + ξ^/2) of the group's matrices.
 
-    It uses only rational functions and square roots. The vector ω gives a rotation by
-    the angle 2 arctan(|ω|/2), so that the chart ends at the angle π.
+    For SO(3) and SE(3) it uses only rational functions and square roots. The vector ω
+    gives a rotation by the angle 2 arctan(|ω|/2), so that the chart ends at the angle
+    π.
 
     !!! example
 
@@ -165,7 +166,7 @@ class Exponential(AbstractRetraction):
     def rotation_vector(
         self, w: FloatScalar, v: Float[Array, "3"]
     ) -> Float[Array, "3"]:
-        """Compute ω = 2 arctan(|v|/w) v/|v| from the tangent of half of the angle."""
+        """Compute ω = 2 arctan(|v|/w) v/|v|, from tan(|ω|/4) = |v|/(1 + w)."""
         # The quaternions q and -q are the same rotation: use the one with shorter ω.
         sign = jnp.where(w < 0, -1.0, 1.0).astype(w.dtype)
         v, w = sign * v, 1 + sign * w

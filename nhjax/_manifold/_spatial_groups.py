@@ -296,8 +296,8 @@ class SE3(AbstractMotionGroup):
     Rotation and translation share a chart, so that the error of a step also depends on
     the distance h|v| that the body moves in the step. If this distance is not small
     compared with the radius of gyration of the body, the group
-    `ProductGroup(Euclidean(3), SO3())` is more accurate. In this group the components
-    of the translational velocity are along the axes of space.
+    `ProductGroup(Euclidean(3), SO3())` is more accurate. In this product the
+    components of the translational velocity are along the axes of space.
 
     **Arguments:**
 

@@ -71,7 +71,7 @@ class ClosureWeights:
     - `start`: shape (s,), the weights of the multiplier λ_k at t_k.
     - `end`: shape (s,), the weights of the continuous multiplier λ_c(q_{k+1}, p_{k+1}).
     - `response`: shape (s-1,), the change of y that compensates a change of λ_{k+1} by
-        one, so that Σ_j a_ij Λ^j, i >= 2, do not change.
+        one, so that the sums Σ_j a_ij Λ^j with i >= 2 stay the same.
     - `stage_response`: shape (s,), the change of Σ_j â_ij Λ^j if λ_{k+1} changes by one
         and y by `response`.
     """
@@ -264,7 +264,7 @@ class AbstractMethod(eqx.Module):
 
         **Raises:**
 
-        `ValueError` with the first condition that fails.
+        `ValueError` that names the first condition that fails.
         """
         for name, holds in self.hypotheses._asdict().items():
             if not holds:
@@ -329,12 +329,12 @@ class LobattoIIIAB(AbstractMethod):
             the previous step as Λ^1. `"consistent"` uses the continuous multiplier at
             the start of the step as Λ^1. `"symmetric"` uses the continuous multipliers
             at both ends of the step, with one more unknown that makes the step
-            symmetric; a step then depends only on its initial state.
+            symmetric. With these two closures, a step does not depend on earlier steps.
         - `chart`: the origin of the chart of a step on a Lie group. With `"middle"` a
-            step with the increment ξ leads from -ξ/2 to ξ/2 in its chart; the step is
-            symmetric, and symplectic if there are no constraints. With `"start"`, the
-            choice of the paper, a step leads from 0 to ξ, and is not symmetric. On a
-            vector space both are the same.
+            step with the increment ξ leads from -ξ/2 to ξ/2 in its chart, which
+            keeps the symmetry of the method and, without constraints, makes the step
+            symplectic. With `"start"`, the choice of the paper, a step leads from 0 to
+            ξ, and is not symmetric. On a vector space both choices are the same.
 
         **Raises:**
 
@@ -361,8 +361,8 @@ class LobattoIIIAB(AbstractMethod):
 
         **Arguments:**
 
-        - `rtol`: the relative tolerance of `nhjax.PIDController`, or the error at the
-            end of a run.
+        - `rtol`: the relative tolerance of `nhjax.PIDController`, or the error that is
+            allowed at the end of a run.
         - `closure`, `chart`: as for `nhjax.LobattoIIIAB`.
 
         **Returns:** a method with 3 to 7 stages.

@@ -62,9 +62,9 @@ class Tableau:
 
     The fields hold mpmath numbers: `mp_a` is an s x s matrix, `mp_b` and `mp_c` are
     lists. An identity between them counts as satisfied if its defect is at most
-    `tolerance`, the round-off of 60 digits for built-in tableaux and of float64 for a
-    user's tableau. Instances compare and hash by identity; the functions that create
-    them are cached.
+    `tolerance`, a bound on the round-off: of 60 digits for built-in tableaux, and of
+    float64 for a user's tableau. Instances compare and hash by identity; the functions
+    that create them are cached.
     """
 
     mp_a: Matrix

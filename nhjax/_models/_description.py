@@ -1,8 +1,8 @@
 """Reading a model from SymPy: its Lagrangian, constraints and forces as expressions.
 
-The model is given as expressions, as a `LagrangesMethod`, or as a `KanesMethod` whose
-speeds u are written in terms of q'. SymPy is an optional dependency, and is imported
-when it is first needed.
+The model is given as expressions, as a `LagrangesMethod`, or as a `KanesMethod`, whose
+speeds u are then written in terms of q'. SymPy is an optional dependency, and is
+imported when it is first needed.
 """
 
 import contextlib
@@ -298,7 +298,7 @@ def generalised_forces(forces: Any, coordinates: list[Any], frame: Any) -> list[
 def _order_by_coordinate(
     forces: Mapping[Any, Any], coordinates: list[Any]
 ) -> list[Any]:
-    """Order the forces of a dictionary by coordinates or their names."""
+    """List forces, given by coordinates or their names, in the order of coordinates."""
     of_name = {str(q.func): q for q in coordinates}
     of_coordinate: dict[Any, Any] = {}
     for key, force in forces.items():

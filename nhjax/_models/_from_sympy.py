@@ -39,7 +39,7 @@ class SymPyModel(eqx.Module):
     """A model that `from_sympy` has imported.
 
     - `system`: the system, whose `args` are a dictionary of the parameters by name.
-    - `args`: the values of the parameters that were given.
+    - `args`: the parameter values that `from_sympy` was given, by name.
     - `coordinates`: the names of the coordinates, in the order of q.
     - `parameters`: the names of all parameters.
     """
@@ -148,8 +148,8 @@ def from_sympy(
         dictionary by coordinates or their names. It may also be a list of pairs:
         (point, force) or (frame, torque), as for `LagrangesMethod`; `frame` is then
         required.
-    - `parameters`: values of the remaining symbols, by symbol or name. Symbols without
-        a value must be in `args` at run time.
+    - `parameters`: values of the remaining symbols, by symbol or name. Values that are
+        not given here must be added to `args` at run time.
     - `frame`: the inertial frame for forces at points and torques on frames.
     - `potential`: the potential energy of a `KanesMethod`. The default is the sum of
         the potential energies of its bodies. The argument is required if bodies have a

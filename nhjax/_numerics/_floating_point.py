@@ -83,9 +83,9 @@ def uneven_perturbations(q: PyTree[Array]) -> PyTree[Array]:
     """Return a perturbation of each number in q, of 0.5 to 1 times the number's size.
 
     The perturbations differ and have both signs, so that they hardly cancel in
-    differences and sums of a few numbers. Relative perturbations are ±(1 - x/2). The x
-    are the fractional parts of multiples of the golden ratio, which are spread evenly
-    over [0, 1).
+    differences and sums of a few numbers. Relative perturbations are ±(1 - x/2), where
+    the numbers x are the fractional parts of multiples of the golden ratio, which are
+    spread evenly over [0, 1).
     """
     numbers, unravel = ravel_pytree(q)
     k = np.arange(numbers.size)

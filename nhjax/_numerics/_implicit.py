@@ -407,8 +407,8 @@ def nan_gradient_unless(ok: BoolScalar, tree: X, parameters: PyTree[Any]) -> X:
     """Return the same values, with derivatives that are NaN where `ok` is false.
 
     The derivatives with respect to all `parameters` are NaN, whether or not the values
-    depend on them. A cotangent of zero stays zero, so that a loss has a derivative if
-    it leaves out failed members.
+    depend on them. A cotangent of zero stays zero, so that a loss has a finite
+    derivative if it leaves out failed members.
     """
     parameters = eqx.filter(parameters, eqx.is_inexact_array)
     return jax.tree.map(

@@ -1,10 +1,10 @@
 """Inverses of small matrices, and loops over their rows, in elementary operations.
 
-As for products (`_contraction`), calling a library of linear algebra inside a time loop
-is too expensive for matrices of a few rows. Up to a size limit, all functions here
-therefore consist of elementary operations. Their loops keep the program short: the
-length of the program does not grow with the number of blocks, and for most functions
-not with the number of rows.
+For matrices of a few rows, calling a library of linear algebra inside a time loop is
+too expensive, as it is for products (`_contraction`). All functions here therefore
+consist of elementary operations; only `inverse` calls a library, for matrices with more
+than `LARGEST` rows. Loops keep the program short: its length does not grow with the
+number of blocks, and for most functions not with the number of rows.
 """
 
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from ._contraction import LARGEST_PRODUCT, small_einsum
 LARGEST = 50
 # In `nhjax.lanes`, matrices with at least this many rows are inverted row by row. For
 # 36 rows the program then compiles 17 times as fast as with operations on the whole
-# matrix, and runs 3 times as fast. With fewer rows the run times are equal.
+# matrix, and runs 3 times as fast. Below this limit, both run equally fast.
 _BY_ROWS_FROM = 8
 
 
@@ -110,7 +110,7 @@ def _sum_of_rows(rows: Float[Array, "k n"]) -> Float[Array, " n"]:
     return reduce(jnp.add, [jnp.sum(part, axis=0) for part in parts])
 
 
-# An inverse of at least `_BY_ROWS_FROM` rows is one operation until it is lowered. In
+# An inverse with at least `_BY_ROWS_FROM` rows is one operation until it is lowered. In
 # XLA, each operation in a loop is expensive. XLA therefore runs the parameter
 # `program`, which consists of operations on the whole matrix. `nhjax.lanes` replaces
 # the operation by its traced implementation, which loops over rows.
@@ -130,10 +130,10 @@ def _by_program(matrix: Array, *, program: Any) -> Array:
 
 
 def _inverse_by_rows(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Compute the same as `compiled_once_inverse`, in loops over single rows.
+    """Compute the same inverse as `compiled_once_inverse`, in loops over single rows.
 
-    Its matrices are in memory. Therefore `nhjax.lanes` cannot compile it as a separate
-    function, whose arguments would be single numbers.
+    This function keeps its matrices in memory. Therefore `nhjax.lanes` cannot compile
+    it as a separate function, because the arguments would be single numbers.
     """
     size = matrix.shape[0]
     numbers = jnp.arange(size, dtype=jnp.int32)
@@ -145,7 +145,7 @@ def _inverse_by_rows(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
             _, _, largest, _ = found
             i = k + offset
             value = _entry(table, i, k)
-            # As in `argmax`, NaN is the largest magnitude.
+            # As in `argmax`, NaN counts as the largest magnitude.
             is_larger = ~(jnp.abs(value) <= largest) & ~jnp.isnan(largest)
             new = i, value, jnp.abs(value), _taken(table, i)
             return jax.tree.map(lambda x, y: jnp.where(is_larger, x, y), new, found)
@@ -229,8 +229,8 @@ def inverse_by_blocks(matrix: Float[Array, "s n s n"]) -> Float[Array, "s n s n"
     Rows are exchanged only within a block. The elimination is stable if the diagonal
     blocks dominate. It is also stable if the matrix is close to a Kronecker product A ⊗
     C, where C has n rows and A can be eliminated stably without row exchanges. The
-    elimination is a loop over blocks, so that the program is short and the matrix may
-    be larger than for `inverse`.
+    elimination is a loop over blocks, so that the program is short even if the matrix
+    has more than `LARGEST` rows.
     """
     s = matrix.shape[0]
 

@@ -32,11 +32,12 @@ _GROWTH, _GROWTH_IF_SLOW = 30.0, 2.0
 _HOPELESS = 1e6
 # An upper bound on the magnification of round-off by the problem.
 _LARGEST_NOISE = 1e5
-# After more than this many iterations, an iteration counts as slow.
+# Convergence counts as slow after more than this many iterations.
 _SLOW = 100
-# The last increment of a slow iteration is treated as noise up to this many times the
-# measured noise. Near positions at which constraints become dependent, increments have
-# been seen to vary between 5 and 19 times the noise without falling further.
+# If convergence is slow, the last allowed increment is treated as noise up to this
+# many times the measured noise. Near positions at which constraints become dependent,
+# increments have been seen to vary between 5 and 19 times the noise without falling
+# further.
 _LAST_UNITS = 32.0
 
 
@@ -116,22 +117,24 @@ def iterate(
     `iteration(x)` returns the next iterate, the sizes of the increment and of the
     iterate, and auxiliary values at x. Increments are measured relative to the size of
     x: `scale`, or the size of the iterate if that is larger, because x may start from
-    zero. If both are zero, increments are measured relative to the first increment. If
-    data are larger than x, their round-off adds to the round-off of x: `scale` plus
-    `round_off` then replaces `scale`. `noise` is a measured size: increments always
-    contain errors of about the unit round-off times `noise`.
+    zero. If both are zero, increments are measured relative to the first increment.
+    `round_off` is the size of data that are larger than x: their round-off adds to the
+    round-off of x, so that `scale` plus `round_off` replaces `scale`, except for the
+    tolerance. `noise` is a measured size: increments always contain errors of about the
+    unit round-off times `noise`.
 
     The iteration ends
 
-    - when an increment is below `tolerance` or the round-off of these sizes;
+    - when an increment is at most `tolerance` times the size of x, or at most the unit
+        round-off times the sizes above;
     - when small increments have stopped falling, because they are then round-off;
     - when an increment is not finite, or far larger than the first increment and the
         iterate;
     - after `max_iterations`. If more than 100 are allowed, the iteration counts as
-        converged if its last increment is at most 32 times the measured noise.
-        Convergence by a factor ρ per iteration leaves an error of increment / (1 - ρ).
-        The noise of all iterations adds up to an error of noise / (1 - ρ), which cannot
-        be avoided.
+        converged if its last increment is at most 32 times the measured noise. With
+        convergence by a factor ρ per iteration, such an increment leaves an error of at
+        most 32 noise / (1 - ρ), and the noise of all iterations causes an error of
+        noise / (1 - ρ) anyway.
 
     The size of round-off depends on the conditioning of the problem, so that a fixed
     threshold would be either too coarse or never met (Hairer, Lubich, Wanner, GNI,
@@ -211,7 +214,7 @@ def _progress(rules: _Rules, before: _Progress, sizes: UpdateNorms) -> _Progress
     believed = jnp.where(stalls, more, before.believed)
     believed = jnp.where(increment < before.smallest, less, believed)
     stagnant = stalls & (left <= believed * magnified)
-    # A tolerance is relative to x itself, and does not depend on the round-off of x.
+    # A tolerance is relative to x itself, without `round_off` and `noise`.
     least = jnp.maximum(rules.least, rules.tolerance_or_eps * sizes.iterate)
     least = jnp.where(has_size, least, rules.tolerance_or_eps * before.first)
     small = increment <= least

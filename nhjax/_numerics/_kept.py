@@ -33,18 +33,18 @@ from ..lanes import (
 from ._contraction import with_small_products
 
 
-# The number of functions whose programs are stored. If there are more, the programs of
-# the least recently used function are removed.
+# The programs of at most this many functions are stored. If there are more, the
+# programs of the least recently used function are removed.
 _MOST_FUNCTIONS = 32
 
 
 class KeptFunction(eqx.Module):
     """A traced function as one operation. It is a tree whose leaves are its arrays.
 
-    Call an instance with trees of the structure of the example with which the function
-    was traced. Leaves that are not arrays always have the values that they have in the
-    example. The operation can be differentiated with respect to all arrays that the
-    function reads.
+    Call an instance with trees that have the structure of the example with which the
+    function was traced. Leaves that are not arrays always have the values that they
+    have in the example. The operation can be differentiated with respect to all arrays
+    that the function reads.
     """
 
     # The type is not `jax.Array`, because JAX has other types for some constants.
@@ -73,12 +73,13 @@ _known: OrderedDict[Hashable, KeptFunction] = OrderedDict()
 def kept_function(
     function: Callable[..., PyTree[Array]], *example: Any
 ) -> KeptFunction | None:
-    """Trace a function for arguments with the structure and the dtypes of an example.
+    """Trace a function for arguments with the structure and the types of an example.
 
-    If the same function is traced again for the same kinds of arguments, and the values
-    that it reads have not changed, its programs are reused. The result is None if the
-    function must not become one operation: if it has effects, such as printing, or if
-    its arguments or constants are sharded over devices.
+    Types are shapes and dtypes. If the same function is traced again for arguments of
+    the same types, and the values that it reads have not changed, its programs are
+    reused. The result is None if the function must not become one operation: if it has
+    effects, such as printing, or if its arguments or constants are sharded over
+    devices.
 
     **Arguments:**
 
@@ -222,8 +223,8 @@ def _in_kernel(*operands: Any, jaxpr: Any, kept: _Program) -> list[Any]:
 
 
 # JAX must not cache a lowered program, because a program is lowered differently inside
-# and outside of a kernel. On the CPU, programs are lowered by `run_program` and not by
-# XLA: the programs are long, and XLA takes milliseconds to compile each operation.
+# and outside of a kernel. On the CPU, `run_program` compiles long programs without XLA,
+# because XLA takes milliseconds to compile each operation.
 for _lower, _platform in ((_inlined, None), (_in_kernel, "cpu")):
     mlir.register_lowering(
         kept_call,
@@ -284,7 +285,7 @@ def _transpose(cotangents, *operands, jaxpr: Any, kept: _Program):
 def _batched(operands, axes, *, jaxpr: Any, kept: _Program):
     sizes = [x.shape[a] for x, a in zip(operands, axes, strict=True) if a is not None]
     if sizes[0] * num_results(jaxpr.jaxpr) >= SHORTEST_IN_LOOP:
-        # A long program becomes a loop over the members.
+        # A long program for many members becomes a loop over the members.
         marks = tuple(axis is not None for axis in axes)
         moved = [
             x if axis is None else jnp.moveaxis(x, axis, 0)

@@ -148,9 +148,9 @@ class DenseMatrix(AbstractOperator):
         return max_norm(self.entries)
 
     def max_norm_equivalent(self) -> "DenseMatrix":
-        """Return a matrix whose products with vectors have the same max norm.
+        """Return a matrix A so that A x and self x have the same max norm for all x.
 
-        If this matrix has one column, the result is a matrix of one entry, max |a_ij|.
+        If `self` has one column, A is a matrix of one entry, max |a_ij|.
         """
         if self.entries.shape[1] != 1:
             return self
@@ -197,7 +197,7 @@ class DiagonalMatrix(AbstractOperator):
 
 
 class SparseMatrix(AbstractOperator):
-    """A matrix B, or a stack with entries in the same places, stored row by row.
+    """A matrix B, or a stack of matrices with entries in the same places.
 
     Entry e of row a has the value `values[..., e, a]`.
     """
@@ -264,7 +264,7 @@ class SparseMatrix(AbstractOperator):
 
 
 class WeightedTranspose(AbstractOperator):
-    """The matrix diag(w) Bᵀ of a sparse matrix B, or of a stack of them."""
+    """The matrix diag(w) Bᵀ of a sparse matrix B, or of each matrix B of a stack."""
 
     weights: Float[Array, " n"]
     matrix: SparseMatrix
@@ -298,7 +298,7 @@ class WeightedTranspose(AbstractOperator):
         return max_norm(self.weights) * max_norm(self.matrix.values)
 
     def max_norm_equivalent(self) -> "WeightedTranspose":
-        """Return a matrix whose products with vectors have the same max norm: self."""
+        """Return self, as a matrix whose products have the same max norm."""
         return self
 
 
@@ -581,10 +581,10 @@ def compressed_products(
     """Compute all products L_i diag(w) R_jᵀ of two stacks in compressed form.
 
     The products are block tridiagonal in the order of the pattern. Among all blocks
-    whose numbers are equal modulo three, each row therefore has entries in at most one
-    block, so that the columns of these blocks can be added. Entry [i, j, c, b, a] of
-    the result is the entry of product (i, j) in row a and in column b of the block
-    whose number is c modulo three.
+    of columns whose numbers are equal modulo three, each row therefore has entries in
+    at most one block, so that the columns of these blocks can be added. Entry
+    [i, j, c, b, a] of the result is the entry of product (i, j) in row a and in column
+    b of the block whose number is c modulo three.
     """
     pattern = left.pattern
     place = np.argsort(pattern.order)

@@ -4,8 +4,8 @@ Constraints are independent if the rows of their Jacobian B are independent. A
 `RankCondition` is a Jacobian whose rank must be full, `reciprocal_condition` measures
 how close the rows are to being dependent, and `dependent_rows` lists the rows for an
 error message. Where redundant constraints are allowed, `least_norm_inverse` replaces
-the inverse of C = B K⁻¹ Bᵀ, in which K is the mass matrix or its inverse. It solves
-C x = b with the least norm of x.
+the inverse of C = B K⁻¹ Bᵀ, in which K is the mass matrix or its inverse. The result
+solves C x = b with the least norm of x.
 """
 
 from typing import NamedTuple
@@ -150,10 +150,10 @@ NEARLY_DEPENDENT = 1e-4
 def least_norm_inverse(
     matrix: Float[Array, "l l"], negligible: float | None = None
 ) -> Float[Array, "l l"]:
-    """Compute the inverse X of a symmetric C that solves C x = b with the least norm.
+    """Compute the generalised inverse X of a symmetric matrix C with the least norm.
 
-    If C x = b has solutions, X b is the solution with the least Σ C_aa x_a². The
-    inverse is X = D (D C D)⁺ D with D = diag(C_aa)^(-1/2). Eigenvalues of D C D count
+    If C x = b has solutions, X b is the solution x with the least Σ C_aa x_a². The
+    result is X = D (D C D)⁺ D with D = diag(C_aa)^(-1/2). Eigenvalues of D C D count
     as zero if they are at most `negligible` times the largest eigenvalue. The default
     is close to round-off. If some constraints are scaled, only their multipliers
     change.

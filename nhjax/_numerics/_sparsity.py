@@ -134,7 +134,7 @@ def _sets(
     known: list[np.ndarray | None],
     shapes: list[tuple[int, ...]],
 ) -> list[np.ndarray] | None:
-    """Return the sets of the results of an operation; None if it is unknown."""
+    """Return the sets of an operation's results; None if the operation is unknown."""
     name, params, n = equation.primitive.name, equation.params, sets[0].shape[-1]
     if name in ELEMENTWISE:
         whole = [np.broadcast_to(s, (*shapes[0], n)) for s in sets]
@@ -184,7 +184,7 @@ def _rearranged(
     sets: list[np.ndarray],
     known: list[np.ndarray | None],
 ) -> list[np.ndarray] | None:
-    """Rearrange sets as an operation rearranges elements; None if unknown."""
+    """Rearrange sets as an operation rearranges elements; None if this is unknown."""
     x, n = sets[0], sets[0].shape[-1]
     last = x.ndim - 1
     if name in ("copy", "copy_p"):

@@ -42,7 +42,7 @@ _KINDS = ("free", "ball", "slide", "hinge")
 
 
 class Layout:
-    """The joints of a model, and the frame of each body relative to its last joint.
+    """The joints of a model, and each body's frame relative to the joint before it.
 
     `source` is the `MjSpec` or `MjModel` that was read; films show its shapes. The
     positions of the bodies named in `moving` are parameters.
@@ -434,8 +434,8 @@ def loops_in(model: Any, layout: Layout, left_out: set[int]) -> Loops:
                 for x in ends
             ]
         elif is_weld:
-            # The first body has the pose data[3:10] relative to the anchor of the
-            # second body, whose position in the second body is data[:3].
+            # The anchor has the pose data[3:10] in the frame of the first body, and the
+            # position data[:3] in the frame of the second body.
             frames = [
                 fixed_to(layout, ends[0], data[3:6], data[6:10]),
                 fixed_to(layout, ends[1], data[:3], none),
@@ -501,7 +501,7 @@ class RollingGeom(NamedTuple):
     is_parameter: bool
 
     def has_radius(self, model: Any) -> bool:
-        """Return whether a single number describes its shape."""
+        """Return whether the geom has a radius; an ellipsoid has three semi-axes."""
         ellipsoid = mujoco().mjtGeom.mjGEOM_ELLIPSOID
         return model.geom_type[self.geom] != int(ellipsoid)
 
@@ -672,7 +672,7 @@ def _radius_in_args(name: str, default: float) -> Callable[[Args], Any]:
 
 
 def _ground(model: Any, layout: Layout, ground: Any) -> AbstractGround:
-    """Return the ground: the plane of the model, or z = 0."""
+    """Return the ground: `ground` itself, a plane of the model, or z = 0."""
     if isinstance(ground, AbstractGround):
         return ground
     plane = int(mujoco().mjtGeom.mjGEOM_PLANE)
@@ -770,7 +770,7 @@ class Kept(NamedTuple):
     - `heights`: for each contact that touches, whether to keep its height.
     - `loops`: whether to keep each equation of the closed loops.
     - `is_independent`: whether these rows are independent near the pose at rest.
-    - `left_out`: the rows that are not kept, or None if all are.
+    - `left_out`: the rows that are not kept, or None if all rows are kept.
     """
 
     slips: list[list[bool]]
@@ -838,7 +838,7 @@ class LeftOut:
         self.rows, self.keep = rows, keep
 
     def check(self, q: PyTree[Array], args: Args) -> None:
-        """Raise unless the constraints hold, and still follow from the others.
+        """Raise unless the left-out constraints hold, and still follow from the others.
 
         The check is skipped while JAX traces q or the lengths in `args`.
         """
@@ -876,9 +876,9 @@ def independent_rows(
 ) -> Kept:
     """Find the constraints that follow from the others in every pose.
 
-    Such rows are left out if the others are independent at the pose at rest and at
-    random poses. Otherwise all rows are kept, because rows that depend on each other
-    only in some poses are needed in other poses.
+    These constraints are left out if the others are independent at the pose at rest and
+    at random poses near it. Otherwise all constraints are kept, because constraints
+    that depend on each other only in some poses are needed in other poses.
     """
     all_rows = _Rows(space, contacts, loops, loop)
     rng, found = np.random.default_rng(1), []

@@ -92,9 +92,9 @@ KINDS = (
 class Parameters(eqx.Module):
     """The numbers of a robot that `args` may replace.
 
-    - `names`: for each kind, a dictionary from the names of bodies, joints or geoms to
-        their places in the arrays. For positions and radii these are places in
-        MuJoCo's model, and are not used here.
+    - `names`: for each of the `KINDS` in use, a dictionary from the names of bodies,
+        joints or geoms to their places in the arrays. For positions and radii these are
+        places in MuJoCo's model, and are not used here.
     - `controls`: the names of the actuators, or None if a function of the user computes
         the controls: `args["controls"]` may then have any structure.
     """
@@ -216,7 +216,7 @@ def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
         masses = args.get("mass", {})
         for i in changed:
             # If the mass of a body changes, its shape and its centre of mass stay the
-            # same, and its inertia is multiplied by the same factor.
+            # same, and its inertia is multiplied by the same factor as its mass.
             factor, name = 1.0, changing_mass.get(i)
             if name in masses:
                 factor = entries.times(masses[name], float(1 / bodies.mass[i]))
@@ -447,7 +447,8 @@ class Connection(NamedTuple):
 class Coupling(NamedTuple):
     """A polynomial between two lengths: y - y₀ = Σ a_i (x - x₀)^i.
 
-    Each length is a row of numbers times the scalar coordinates.
+    Each length is a row of numbers times the scalar coordinates: the row `first` for y,
+    and the row `second` for x.
     """
 
     name: str

@@ -16,7 +16,7 @@ import numpy as np
 from .._errors import check_choice
 
 
-# Angles in URDF files that differ by less than this [rad] from a multiple of a
+# Angles in URDF files that differ by less than this [rad] from a nonzero multiple of a
 # quarter turn are replaced by this multiple.
 _ROUNDED_ANGLE = 1e-3
 # URDF files that were written for ROS name the files of meshes by addresses that begin
@@ -182,7 +182,7 @@ def _complete_quarter_turns(robot: ElementTree.Element) -> None:
             try:
                 turns = float(word) / quarter
             except ValueError:
-                continue  # MuJoCo names the mistake.
+                continue  # MuJoCo reports the mistake later.
             number = round(turns)
             if number and abs(turns - number) * quarter < _ROUNDED_ANGLE:
                 words[place] = repr(number * quarter)
@@ -251,7 +251,7 @@ def name_of(model: Any, kind: str, number: int) -> str:
 
 
 def label_of(model: Any, geom: int) -> str:
-    """Return the name of a geom, or its number, its shape and its body."""
+    """Return the name (or the number) of a geom, with its shape and its body."""
     number = int(model.geom_bodyid[geom])
     body = name_of(model, "body", number) if number else "the world"
     word = mujoco().mjtGeom(model.geom_type[geom]).name[7:].lower()
@@ -380,8 +380,8 @@ def _joints(model: Any) -> Iterator[Unsupported]:
                 None,
                 f"joint {name!r}: gravity compensation by an actuator with a limit",
             )
-        # In a model without actuators, MuJoCo omits gravity compensation for this
-        # joint, but not for other joints.
+        # In a model without actuators, MuJoCo omits gravity compensation for joints
+        # with `actgravcomp`, but not for other joints.
         if model.jnt_actgravcomp[joint] and model.ngravcomp and not model.nu:
             yield Unsupported(
                 None,
@@ -519,7 +519,7 @@ def active_equalities(model: Any) -> list[int]:
 
 
 def _contacts(model: Any, rolling: Collection[int]) -> Iterator[Unsupported]:
-    """Yield one entry for all pairs of geoms that can touch in MuJoCo."""
+    """Yield one entry for all pairs of geoms that can touch, unless they roll."""
     if has_flag(model, "CONTACT") or has_flag(model, "CONSTRAINT"):
         return
     pairs = [
@@ -532,7 +532,7 @@ def _contacts(model: Any, rolling: Collection[int]) -> Iterator[Unsupported]:
 
 
 def _rolls(model: Any, pair: tuple[int, int], rolling: Collection[int]) -> bool:
-    """Return whether a pair is a rolling geom and a geom of the world."""
+    """Return whether a pair is a rolling geom and a geom fixed to the world."""
     for one, other in (pair, pair[::-1]):
         if one in rolling and model.body_weldid[model.geom_bodyid[other]] == 0:
             return True

@@ -120,7 +120,10 @@ class Robot(eqx.Module):
         return y
 
     def _add_note_on_heights(self, error: Exception, t: Any, q: Any, args: Any) -> None:
-        """Name the wheels that do not touch the ground, if the positions are known."""
+        """Add a note to an error with the geoms that do not touch the ground.
+
+        The note is omitted while JAX traces the heights.
+        """
         if self.contacts is None:
             return
         pairs = zip(self.contacts.names, self.contacts.contacts, strict=True)
@@ -168,7 +171,7 @@ class Robot(eqx.Module):
     def pose(
         self, body: str, q: PyTree[Array], args: Args = None
     ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-        """Compute the position of a body [m] and its rotation to space.
+        """Compute the position [m] of a body, and the rotation from its frame to space.
 
         **Arguments:**
 
@@ -257,8 +260,8 @@ def from_mujoco(
     MuJoCo's own compiler reads the model. The Lagrangian is the kinetic energy
     ½ Σ tr(Ṫ J Ṫᵀ) of all bodies with poses T and pseudo-inertias J, plus ½ a q̇² for
     each armature a, minus the potential energies of weight and springs. A free joint
-    has coordinates in R³ x SO(3), and a ball joint in SO(3). All other joints together
-    have coordinates in R^n. The equality constraints connect, weld, joint and tendon
+    has coordinates in R³ x SO(3), and a ball joint in SO(3). All other joints have
+    coordinates in R^n. The equality constraints connect, weld, joint and tendon
     become holonomic constraints. They hold exactly, unlike in MuJoCo, and `solref` and
     `solimp` have no effect. Source: Featherstone, *Rigid body dynamics algorithms*
     (2008); the MuJoCo documentation, chapter *Computation*.
@@ -278,8 +281,9 @@ def from_mujoco(
         off.
     - `ground`: the name of a plane that is fixed to the world, or a ground of
         `nhjax.rolling`. The default is the only plane of the model, or z = 0.
-    - `root`: for a URDF file, how the root link can move. MuJoCo fixes it to the world;
-        `"free"` adds a free joint, and `"planar"` the coordinates x, y and heading.
+    - `root`: for a URDF file, how the root link can move. `"free"` adds a free joint,
+        and `"planar"` the coordinates x, y and heading. `"fixed"` leaves it fixed to
+        the world, as MuJoCo does.
     - `motors`: the names of joints that get a motor, in addition to the actuators of
         the file. The control of a motor is its torque [N m] or force [N]. URDF files
         have no actuators; `<transmission>` is not read.
@@ -294,7 +298,7 @@ def from_mujoco(
         position of a body is the vector [m] from the frame of its parent to its own
         frame, of shape (3,), such as the length of a link. Another vector moves the
         body and all bodies attached to it. A wheel with another radius keeps its mass
-        and its inertia. Films show the lengths of the file.
+        and its inertia. Films show the lengths of the file, not of `args`.
     - `ignore`: unsupported parts to leave out: `"actuators"`, `"contacts"`,
         `"equalities"`, `"fluid"`, `"friction loss"`, `"limits"`, `"plugins"`,
         `"springs"`, `"tendons"`.
@@ -306,8 +310,8 @@ def from_mujoco(
     - `friction_smoothing`: v₀ [rad/s or m/s] in the friction loss f tanh(q̇ / v₀) of a
         joint.
     - `limit_smoothing`: the width of the smooth transition at the limits of controls
-        and forces of actuators, as a fraction of their range. Farther than 36 widths
-        from the limits, values are not changed.
+        and forces of actuators, as a fraction of their range, or of the limit if there
+        is only one. Farther than 36 widths from the limits, values are not changed.
 
     **Returns:** a `Robot`.
 
@@ -434,9 +438,9 @@ _FOLDER = Path(__file__).parent / "models"
 
 _LEFT_ROLLERS, _RIGHT_ROLLERS = -math.pi / 4, math.pi / 4
 # The right front wheel of the car may slip sideways, because a steering trapezoid does
-# not turn both front wheels exactly about one centre. On the quadruped, when all wheels
-# are parallel, the lateral constraint of a right wheel would repeat the lateral
-# constraint of the opposite left wheel.
+# not turn both front wheels exactly about one centre. The right wheels of the quadruped
+# may slip sideways too: when all wheels are parallel, their lateral constraints would
+# repeat the lateral constraints of the left wheels.
 _OPTIONS: Mapping[str, tuple[str, dict[str, Any]]] = MappingProxyType(
     {
         "ackermann_car": (

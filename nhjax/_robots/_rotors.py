@@ -1,9 +1,9 @@
 """Wheels and rotors: bodies whose inertia does not change while their joint turns.
 
-Such a body at the end of a branch needs no frame of its own. Its inertia is added to
+At the end of a branch, such a body needs no frame of its own. Its inertia is added to
 the inertia of its parent, as if both were fixed together. With the twist ξ of the
-parent, the joint rate s' adds s' h·ξ + ½ I s'² to the kinetic energy. The program of a
-robot on wheels is then as short as a program written by hand.
+parent, the joint rate s' then adds s' h·ξ + ½ I s'² to the kinetic energy. The program
+of a robot on wheels is therefore as short as a program written by hand.
 """
 
 from collections.abc import Sequence

@@ -119,7 +119,7 @@ class Space:
         return v if self.manifold is None else self.manifold.tangent(q, v)
 
     def from_qpos(self, qpos: Float[Array, " nq"]) -> PyTree[Array]:
-        """Convert MuJoCo's coordinates."""
+        """Convert MuJoCo's coordinates to q."""
         elements, place = [], 0
         for part in self.parts:
             sizes = {"free": (3, 4), "ball": (4,)}.get(part.kind, (len(part.joints),))
@@ -129,7 +129,7 @@ class Space:
         return tuple(elements) if self.is_product else elements[0]
 
     def to_qpos(self, q: PyTree[Array]) -> Float[Array, "*batch nq"]:
-        """Convert to MuJoCo's coordinates, with any leading axes."""
+        """Convert q, with any leading axes, to MuJoCo's coordinates."""
         return jnp.concatenate(q, axis=-1) if self.is_product else q
 
 

@@ -31,8 +31,8 @@ class AbstractChart(eqx.Module):
 
     The methods transport velocities and covectors from g_o τ(y) to the chart and back
     (paper, section 6). A step starts at g_k, and ξ = h Σ b_j H^j is its increment, with
-    the stage velocities H^j in the chart. The origin depends on ξ and on the kind of
-    chart.
+    the stage velocities H^j in the chart. The origin depends on the kind of chart, and
+    for `MiddleChart` on ξ.
     """
 
     manifold: eqx.AbstractVar[AbstractLieGroup]

@@ -92,8 +92,8 @@ class StageEquations(eqx.Module):
     in the chart of the method. Let y^i be the coordinates of stage i in the chart, and
     Π^i its momentum in the chart. Let w^i be the body force at stage i, including
     reactions, let n^i = Ad^*_{τ(y^i)⁻¹} w^i be this force carried to the origin of the
-    chart, and F^i the same force in the chart. Let μ^i be the body momentum at node i,
-    and M the momentum μ_k carried to the origin. With `base` from
+    chart, and let F^i be the force of `AbstractChart.to_chart`. Let μ^i be the body
+    momentum at node i, and M the momentum μ_k carried to the origin. With `base` from
     `AbstractChart.base_momentum`, the equations are
 
     Π^i = base + h Σ â_ij F^j,    μ^i = Ad^*_{τ(y^i)} (M + h Σ a_ij n^j),
@@ -108,7 +108,7 @@ class StageEquations(eqx.Module):
 
     - the constant matrices of `method.closure_weights`;
     - the multiplier that a state carries, which is Λ^s for the propagated closure and
-        λ_c for the others (`end_state`, `first_step_state`);
+        λ_c for the other closures (`end_state`, `first_step_state`);
     - two more unknowns and equations if the closure uses λ_c at the end
         (`end_multiplier_is_unknown`).
 
@@ -345,9 +345,10 @@ def forces_by_multiplier(
 def momenta_of_forces(
     stages: StageEquations, x: StageUnknowns, forces: Float[Array, "s n c"]
 ) -> tuple[Float[Array, "s n c"], Float[Array, "r n c"]]:
-    """Compute momenta / h of stages and nodes that are due to forces at the stages.
+    """Compute the momenta / h that forces at the stages cause at stages and nodes.
 
-    The chart transports forces from stage to stage, which adds a term of order h.
+    On a Lie group, the chart transports the forces between stages, which adds a term of
+    order h.
     """
     a_hat, b = stages.coefficients("a_hat"), stages.coefficients("b")
     if stages.manifold.is_flat:
@@ -700,7 +701,7 @@ def stage_residual(
     """Evaluate all equations of a step in one vector.
 
     The paper lists these equations in its four summaries. Your own stage solver looks
-    for the stages at which the vector vanishes; see the page on extending in the
+    for the x at which this vector vanishes; see the page on extending in the
     documentation.
 
     **Arguments:**

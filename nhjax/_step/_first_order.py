@@ -28,8 +28,8 @@ JacobianName: TypeAlias = Literal["leading", "first_order", "full"] | None
 # The terms make a step faster if the saved iterations cost more time than the terms.
 # This is the case if there are no holonomic constraints, and at most this many stages,
 # coordinates, and entries of the responses of stages to multipliers. For one trajectory
-# of a larger system, the larger program is no longer compiled to scalar operations, and
-# is several times slower.
+# of a larger system, the program with the terms is no longer compiled to scalar
+# operations, which makes it several times slower.
 _MOST_STAGES, _MOST_COORDINATES, _MOST_RESPONSES = 5, 6, 100
 
 
@@ -176,8 +176,8 @@ class FirstOrderTerms(eqx.Module):
 
 # If the size of h N⁻¹ ∂F/∂H is larger than this, the Neumann series of
 # `FirstOrderTerms` does not converge. An example is friction that changes steeply near
-# rest. The leading part of the Jacobian alone then converges better, in particular if
-# the friction saturates at a low velocity.
+# rest. Iterations with the leading part of the Jacobian alone then converge better, in
+# particular if the friction saturates at a low velocity.
 _LARGEST = 5.0
 
 
@@ -246,8 +246,9 @@ class _BodySlopes(NamedTuple):
     """Derivatives at the start of a step, in the body frame.
 
     - `inertia_rate`: the rate of N = ∂p/∂u along the motion.
-    - `momentum`: the derivative, with respect to the position, of the momentum at the
-        position minus the initial momentum, transported there by the chart.
+    - `momentum`: the derivative, with respect to the position, of the difference
+        between the momentum there and the initial momentum that the chart transports
+        there.
     """
 
     inertia_rate: Float[Array, "n n"]

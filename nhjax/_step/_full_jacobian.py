@@ -98,7 +98,7 @@ class LinearisedStep(eqx.Module):
     stages, and the multipliers from a Schur complement.
 
     For a Hamiltonian system δμ_i = (∂v_i/∂μ)⁻¹ (δH_i - ∂v_i/∂Ξ δΞ_i - ∂v_i/∂ξ δξ), and
-    the derivatives above are total derivatives.
+    the derivatives above include this change of μ_i.
     """
 
     stages: Float[Array, "s n s n"]  # the inverse of ∂r_i/∂H_j
@@ -157,7 +157,7 @@ class LinearisedStep(eqx.Module):
         x: StageUnknowns,
         reaction: Float[Array, "s n"],
     ) -> StageResponses:
-        """Compute the changes / h of stages and nodes due to given reactions."""
+        """Compute the changes / h that given reactions cause at stages and nodes."""
         on_stages, on_nodes = momenta_of_forces(stages, x, reaction[..., None])
         on_stages, on_nodes = on_stages[..., 0], on_nodes[..., 0]
         velocity, momentum = self.of_stages(stages, on_stages)

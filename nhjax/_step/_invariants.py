@@ -24,13 +24,14 @@ from .._system import (
 )
 
 
-# An impulse changes an invariant by at most this fraction of Σ |u ∂I/∂u|. Near rest
-# this sum is small, and there may be no impulse that corrects the error.
+# An impulse changes an invariant by at most this fraction of Σ |u ∂I/∂u|, added up over
+# both ends of the step. Near rest this sum is small, and there may be no impulse that
+# corrects the error.
 _LARGEST_PART = 0.1
 # With an indefinite mass matrix, ω·M⁻¹ω can vanish although ω does not. If ω·M⁻¹ω is
 # less than this fraction of its bound Σ_ij |M⁻¹_ij| ω_i², a step has no impulse. All
 # other impulses are at most 1 / 0.03 times as large as with a definite matrix of the
-# same size. Fractions from 0.01 to 0.3 gave the same largest errors of motions.
+# same size. Fractions from 0.01 to 0.3 gave the same largest errors of test motions.
 LEAST_PART = 0.03
 
 
@@ -39,7 +40,7 @@ class Invariants(eqx.Module):
 
     - `function`: called as `function(t, q, u, args)`, returns shape (k,). None stands
         for the energy of the system.
-    - `value`: the k values.
+    - `value`: the k values that are kept.
     - `least_sizes`: the measured round-off of the functions at the start of the run,
         divided by the unit round-off. It includes the round-off of constants that
         cancel.
@@ -251,8 +252,8 @@ class InvariantCorrection(eqx.Module):
 
     Here ϵ is the unit round-off, S is the size of the terms of I, and δ is the impulse
     that would change velocities by their own size, so that x does not depend on units.
-    Unless x is small, a is 1 up to round-off. At rest x vanishes, and no impulse can
-    keep I.
+    Unless x is small, a is 1 up to round-off. At rest, where no impulse can keep I, x
+    and a vanish.
 
     With an indefinite mass matrix, G can also be singular away from rest. In such
     steps a = 0 for all kept functions; see `LEAST_PART`.

@@ -103,8 +103,8 @@ def simplified_newton_update(
         x_next = factors.correct_multipliers(stages, x_next, kinematic, holonomic)
     if stages.end_multiplier_is_unknown:
         # λ_c depends on v_{k+1} at zeroth order: it must be corrected with the new
-        # velocity. Otherwise the two errors feed each other, and an iteration reduces
-        # them only by the square root of the usual factor.
+        # velocity. Otherwise each of the two errors adds to the other, and an iteration
+        # reduces them only by the square root of the usual factor.
         x_next = factors.correct_end(stages, x_next, end_residual(stages, x_next))
     return x_next, Evaluation(forces, r_nodes, jnp.asarray(False))
 
@@ -284,7 +284,7 @@ class NewtonFactors(eqx.Module):
 
     If the run keeps invariants, the impulses are eliminated last. Row k of `impulses`
     is a change of all unknowns with a unit impulse for invariant k. This change leaves
-    all residuals the same, except the residuals of the equations for the impulses. The
+    all residuals unchanged, except the residuals of the equations for the impulses. The
     changes of these residuals form a matrix, whose inverse is `schur_inverse`. Without
     invariants `impulses` and `schur_inverse` are None.
     """
@@ -876,8 +876,8 @@ def update_norms(
 ) -> UpdateNorms:
     """Measure an increment and the fibre coordinates of the next iterate.
 
-    Only the coordinates at the end of the step are measured: this is enough to judge
-    the increment, and measuring all coordinates would cost time.
+    The increment is measured at all stages and nodes, but the size of the coordinates
+    only at the end of the step: this is enough for a scale, and takes less time.
     """
     increment = increment_size(stages, x, x_next, lin)
     return UpdateNorms(increment, max_norm(x_next.node_fibre_coordinate[-1]))

@@ -16,8 +16,8 @@ samples determine this factor, so that
 
     U_{p+1} ≈ U_s r^(p+1-s).
 
-In an oscillation the rate of u, and with it U_1, passes through zero twice in each
-period, and so does U_3. The ratio of U_3 and U_1 still determines r. Where U_3
+For example, let s = 3. In an oscillation the rate of u, and with it U_1, passes through
+zero twice in each period, and so does U_3. Their ratio still determines r. Where U_3
 vanishes but U_1 does not, the ratio of U_2 and U_1 is used. This ratio grows near a
 zero of U_1, and is therefore limited by the growth that earlier steps have shown.
 
@@ -51,7 +51,7 @@ from ._step import StepOutcome, StepState
 # (`benchmarks.adaptive_steps`).
 _GROWTH, _GROWTH_BY_COMMUTATOR = 2.8, 1.2
 # Velocities in a chart also change because of the chart. Therefore their derivatives
-# are multiplied by this factor, which was fitted in the same way.
+# are multiplied by this factor, which was fitted to the same errors.
 _PART_IN_CHART = 0.5
 
 

@@ -46,8 +46,8 @@ class Redundancy(eqx.Module):
         projector = jax.scipy.linalg.block_diag(whole[:m, :m], whole[m:, m:])
         unit = jnp.eye(projector.shape[0], dtype=projector.dtype)
         sizes = jnp.sum(jnp.abs(delassus) * unit, axis=1)
-        # If the derivatives of a constraint are zero, they give no size for the
-        # equation of its multiplier. The size one is then used.
+        # If the derivatives of a constraint are zero, they give no scale for the
+        # equation of its multiplier. The scale is then one.
         sizes = jnp.where(sizes > 0, sizes, 1)
         return cls(projector, (unit - projector) * sizes[None, :])
 

@@ -13,8 +13,8 @@ from .._system import FunctionNoise, Linearisation
 
 # When the increments of the stages stop falling, they can be six times as large as the
 # round-off that the functions of a system cause in them. Increments count as noise up
-# to `NOISE_UNITS` = 400 times the unit round-off times a size. With the fraction
-# `PART`, they count as noise up to 50 times the measured round-off.
+# to `NOISE_UNITS` = 400 times a given round-off. The measured round-off is therefore
+# multiplied by `PART`: increments then count as noise up to 50 times its size.
 PART = 1 / 8
 
 

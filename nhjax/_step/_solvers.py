@@ -94,20 +94,21 @@ class SimplifiedNewton(AbstractStageSolver):
 
     The leading part and the terms of order h omit the stiffness: the derivatives of
     forces, inertia and reactions with respect to positions. On machines with feedback
-    control, stiff springs or light steered parts this makes the iteration slow or
-    divergent. The full Jacobian has all derivatives, at the starting values of the
+    control, stiff springs or light steered parts this omission makes the iteration slow
+    or divergent. The full Jacobian has all derivatives, at the starting values of the
     step. It is computed and inverted once a step, which costs as much as 3 to 15
     iterations.
 
     If simplified Newton does not converge, Newton's method with the exact Jacobian may
     still converge. With the option `fallback`, Newton's method takes over in such a
     step, and `Solution.stats["num_newton_steps"]` counts these steps. A program that
-    contains both methods takes about three times as long to compile. For this reason a
-    plain call of `integrate`, outside all transformations of JAX, first runs without
-    the fallback. If a step was not solved, the call repeats the run with the full
-    Jacobian. If a step is still not solved, the call repeats the run with the fallback.
-    In your own transformed program (`jax.jit`, `jax.vmap`, `jax.grad`), a step that is
-    not solved ends the run, unless you request the full Jacobian or the fallback.
+    contains both methods takes about three times as long to compile as simplified
+    Newton alone. For this reason a plain call of `integrate`, outside all
+    transformations of JAX, first runs without the fallback. If a step was not solved,
+    the call repeats the run with the full Jacobian, if `jacobian` is None. If a step is
+    still not solved, the call repeats the run with the fallback. In your own
+    transformed program (`jax.jit`, `jax.vmap`, `jax.grad`), no run is repeated: request
+    the full Jacobian or the fallback there if steps are not solved.
 
     **Arguments:**
 
@@ -125,11 +126,11 @@ class SimplifiedNewton(AbstractStageSolver):
             the terms of order h.
         - `"full"`, the full Jacobian, for machines whose steps need many iterations or
             are not solved.
-        - None, the default: the terms of order h are included if they reduce the run
-            time. They do so if all m constraints are nonholonomic, there are s <= 5
-            stages and n <= 6 coordinates, and s (s - 1) n m <= 100. The terms are not
-            available for Hamiltonian systems, for redundant constraints, and for so
-            many constraints that their matrices are sparse.
+        - None, the default: the terms of order h are included if they should reduce the
+            run time. This is assumed if all m constraints are nonholonomic, there are
+            s <= 5 stages and n <= 6 coordinates, and s (s - 1) n m <= 100. The terms
+            are not available for Hamiltonian systems, for redundant constraints, and
+            for so many constraints that their matrices are sparse.
 
     !!! example
 
@@ -207,7 +208,7 @@ def is_simplified_alone(stage_solver: AbstractStageSolver) -> bool:
 
 
 def has_default_jacobian(stage_solver: AbstractStageSolver) -> bool:
-    """Return whether the solver is simplified Newton with its approximate Jacobian."""
+    """Return whether the solver is simplified Newton with its default Jacobian."""
     return isinstance(stage_solver, SimplifiedNewton) and stage_solver.jacobian is None
 
 
@@ -230,7 +231,7 @@ class Newton(AbstractStageSolver):
     The Jacobian is computed at each iterate and eliminated by blocks. An iteration
     costs more than an iteration of `SimplifiedNewton`, but the method converges for
     larger steps and for stiff forces. Stiff forces magnify round-off in the increments.
-    This solver distinguishes such increments from the increments of an iteration that
+    This solver distinguishes such round-off from the increments of an iteration that
     has not converged. Both solvers give the same trajectory to round-off.
 
     **Arguments:** `max_iterations` and `tolerance`, as for `SimplifiedNewton`.
@@ -329,7 +330,8 @@ def _solved(
     refinement for the first r. Rows are not exchanged between blocks, so that the
     elimination can lose digits even if J is regular. If the refinement detects such a
     loss, the equations are solved by elimination with partial pivoting of all rows.
-    Larger systems are solved by `jnp.linalg.solve`.
+    Larger systems, and systems whose forces have no forward-mode derivatives, are
+    solved by `jnp.linalg.solve`.
     """
     flat = jnp.stack([ravel_pytree(r)[0] for r in rights])
     _, residuals = ravel_pytree(rights[0])

@@ -131,8 +131,9 @@ class StepOutcome(NamedTuple):
     - `record`, `stages`: the stages of the step, for dense output and for derivatives.
     - `result`: whether the step was solved, and otherwise the reason why not.
     - `num_iterations`: the number of iterations of the stage solver.
-    - `residual`: the residual of the stage equations, relative to the momenta.
-    - `worst_coordinate`: the index of the coordinate whose equations have the largest
+    - `residual`: the largest residual of the momentum equations, relative to the
+        momenta plus h times the forces.
+    - `worst_coordinate`: the index of the coordinate whose momentum equations have this
         residual.
     - `constraint_violation`: the largest violation of a constraint at the end.
     - `multiplier_defect`: the distance |Λ^s - λ_c| at the end.
@@ -448,8 +449,8 @@ def error_ratios(
         gained = h * small_einsum("s,sn->n", weights, force)
         return moved, lin.momentum_inverse.matvec(gained)
 
-    # The divisor is increased by the round-off of u, because a difference of this size
-    # contains no information about the error.
+    # The divisor is increased by `NOISE_UNITS` times the round-off of u, because
+    # smaller differences contain no information about the error.
     round_off = float(jnp.finfo(u.dtype).eps) * max_norm(u)
     if stages.noise is not None:
         noise = noise_of_step(stages.method, lin, stages.noise, h)

@@ -29,7 +29,7 @@ Kind: TypeAlias = type | tuple[type, ...]
 
 
 def check_type(name: str, x: object, kind: Kind, advice: str = "") -> None:
-    """Raise a `TypeError` unless `x` is an instance of `kind`, one or more types."""
+    """Raise a `TypeError` unless `x` is an instance of a type in `kind`."""
     if isinstance(x, kind):
         return
     if isinstance(x, type):
@@ -185,8 +185,8 @@ def parameter(value: ArrayLike) -> Array:
 def parameters(args: Args) -> Args:
     """Convert the floats in `args` to arrays, so that changing them does not recompile.
 
-    Other values are compiled in. A `TypeError` is raised if such a value is not
-    hashable.
+    Arrays stay as they are. All other values are compiled in, and raise a `TypeError`
+    if they are not hashable.
     """
 
     def leaf(path, x):
@@ -228,8 +228,8 @@ def check_signature(
 
     **Arguments:**
 
-    - `owner`, `name`: two names for the message: the object or function of nhjax that
-        receives the function, and the argument.
+    - `owner`, `name`: names for the message: `owner` is the object or function of nhjax
+        that receives the user's function, and `name` is the argument.
     - `function`: the function.
     - `arguments`: the names of its arguments, in their order.
     """

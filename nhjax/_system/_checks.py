@@ -156,8 +156,8 @@ def check_multiplier(
 ) -> None:
     """Raise unless `y` has a multiplier for each constraint of `system`.
 
-    The check traces the user's constraints. Compiled programs run it while they are
-    traced, so that calls of a compiled program do not repeat it.
+    The check traces the user's constraints. Compiled programs run this check only while
+    they are traced, so that later calls do not repeat it.
     """
     t = jax.ShapeDtypeStruct((), y.v.dtype)
     u = system.fibre_coordinate(y)
@@ -247,7 +247,11 @@ def dependent_names(matrix: Float[Array, "l c"], num_holonomic: int) -> str:
 def require_independent(
     system: AbstractMechanicalSystem, t: FloatScalar, y: State, args: Args
 ) -> None:
-    """Raise a `DependentConstraintsError` if constraints are dependent at a state."""
+    """Raise a `DependentConstraintsError` if constraints are dependent at a state.
+
+    With `constraints="redundant"`, only a constraint whose derivative with respect to u
+    is zero raises this error.
+    """
     u = system.fibre_coordinate(y)
     jacobian = jax.jacrev(system.constraint, argnums=2)(t, y.q, u, args)
     is_redundant = system.constraints == "redundant"

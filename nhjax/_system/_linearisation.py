@@ -43,8 +43,8 @@ from ._systems import AbstractMechanicalSystem, check_time_and_state, State
 # With fewer constraints than this, sparse matrices save little. With four constraints
 # in a chain, sparse matrices reduce the time of a step to a third.
 _FEWEST_SPARSE = 4
-# Matrices are stored sparse only if each of their blocks, with `SparsityPattern.group`
-# constraints, has at most this fraction of all constraints.
+# Matrices are stored sparse only if each block of C, with `SparsityPattern.group`
+# rows, has at most this fraction of all rows.
 _LARGEST_BLOCK = 1 / 4
 
 
@@ -194,9 +194,9 @@ def motion_residual(
 ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
     """Compute the residuals of the equations of motion and of the hidden constraint.
 
-    These are ṗ - ad*_v p - W and dΦ/dt along (q̇, u̇) = (q v, a), where a is the given
-    `acceleration`. They vanish if the multiplier is the continuous multiplier λ_c(q, u)
-    and a is the acceleration of the motion.
+    The residuals are ṗ - ad*_v p - W and dΦ/dt along (q̇, u̇) = (q v, a), where a is
+    the given `acceleration`. They vanish if the multiplier is the continuous multiplier
+    λ_c(q, u) and a is the acceleration of the motion.
     """
     v = system.velocity(t, q, u, args)
     (p, _), (p_dot, phi_dot) = jax.jvp(
@@ -239,7 +239,7 @@ def constraint_matrices(
     *,
     may_be_sparse: bool = False,
 ) -> ConstraintMatrices:
-    """Compute the fibre Hessian and the derivatives of the constraints at (t, q, u).
+    """Compute K⁻¹, B, K⁻¹ Bᵀ and C⁻¹ (see `Linearisation`) at (t, q, u).
 
     With `may_be_sparse` the matrices of many constraints are sparse where this is
     faster.
@@ -377,10 +377,10 @@ def continuous_multiplier(
 ) -> Float[Array, " l"]:
     """Compute the multiplier λ_c of the continuous equations of motion at a state.
 
-    It follows from the hidden constraint dΦ/dt = 0, and for holonomic constraints,
-    whose rows come last, from d²Γ/dt² = 0 (the paper's section 3). Along a trajectory
-    of a Lobatto method with s stages, this multiplier has order 2s-2, while the
-    multiplier that the paper propagates has order s or s-1.
+    The multiplier follows from the hidden constraint dΦ/dt = 0, and for holonomic
+    constraints, whose rows come last, from d²Γ/dt² = 0 (the paper's section 3). Along a
+    trajectory of a Lobatto method with s stages, this multiplier has order 2s-2, while
+    the multiplier that the paper propagates has order s or s-1.
 
     **Arguments:**
 
@@ -415,9 +415,10 @@ def _constraint_pattern(
 ) -> SparsityPattern | None:
     """Find the sparsity pattern of B = ∂Φ/∂u; None if B is better stored dense.
 
-    B is stored dense if constraints are redundant or of both kinds, if the force
-    depends on the multipliers, or if each constraint shares coordinates with many
-    others, so that B K⁻¹ Bᵀ is full.
+    B is stored dense if the system allows redundant constraints, has both nonholonomic
+    and holonomic constraints, or has a force that depends on the multipliers. B is also
+    stored dense if constraints share coordinates with many others, because B K⁻¹ Bᵀ
+    then has large blocks.
     """
     kinds = [system.nonholonomic, system.holonomic]
     if system.constraints == "redundant" or None not in kinds:

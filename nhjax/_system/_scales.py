@@ -39,8 +39,8 @@ def violation_scale(
 
     The estimate treats Φ as affine in u. The terms at u itself may be too small: a
     constraint such as v[1] has a single term, which is round-off in every state that
-    satisfies the constraint. If u is zero, the size of velocities is unknown. It is
-    taken as one, since terms that cancel have round-off at rest too.
+    satisfies the constraint. If u is zero, the size of velocities is unknown, and one
+    is used, since terms that cancel have round-off at rest too.
     """
     return velocity_scale(system, lin.jacobian, t, q, u, args)
 
@@ -123,7 +123,8 @@ def keeps_constraints(
 ) -> BoolScalar:
     """Return whether all constraints hold at y, up to `small` times their terms.
 
-    Violations of velocity and position constraints up to their `round_off` are allowed.
+    Larger violations are allowed too, up to `round_off`: its two entries bound the
+    violations of velocity and of position constraints.
     """
     u = system.fibre_coordinate(y)
     positions = system.position_constraint(t, y.q, args)

@@ -150,7 +150,7 @@ class AbstractMechanicalSystem(eqx.Module):
     Lagrangian and Hamiltonian systems differ in the fibre coordinate u, which is the
     velocity of a Lagrangian and the momentum of a Hamiltonian system. Both kinds
     provide the functions `velocity`, `momentum`, `conservative_force`, `constraint` and
-    `metric` of (t, q, u). The equations of a step use only these functions, and
+    `metric` of (t, q, u). The equations of a step use these functions, and
     `free_force`, which may depend on the multipliers too.
     """
 
@@ -282,7 +282,7 @@ class AbstractMechanicalSystem(eqx.Module):
         multiplier: Float[Array, " l"],
         args: Args,
     ) -> Float[Array, " n"]:
-        """Compute the force without the constraint reactions, L_q^* D1L + F."""
+        """Compute the conservative force plus F, without the constraint reactions."""
         conservative = self.conservative_force(t, q, u, args)
         if self.force is None:
             return conservative

@@ -74,7 +74,8 @@ def release(value: ArrayValue) -> None:
 
 # Arrays with more numbers than this are in memory, unless they must be in registers.
 MOST_IN_REGISTERS = 128
-# At most this many numbers are loaded, stored or computed one by one.
+# For arrays with more numbers than this, loads, stores and computations are not written
+# number by number: a loop is used, or the program is refused.
 MOST_ONE_BY_ONE = 4096
 # Copies of more numbers than this become loops.
 _LONGEST_UNROLLED = 16

@@ -57,7 +57,8 @@ _Indices: TypeAlias = tuple[str, str, str]
 # Sums of products of two arrays with more terms than this are computed in a loop. The
 # loop takes less time to compile than written-out terms, and runs as fast.
 _LONGEST_PRODUCT = 1000
-# Sums of products with more terms than this are left to a library.
+# Programs that contain sums of products with more terms than this are left to XLA,
+# which calls a library for these sums.
 _LARGEST_PRODUCT = 2**16
 
 
@@ -630,7 +631,7 @@ def loop(
     carried: list[ArrayValue] = []
     for value, is_there in zip(inits, in_memory, strict=True):
         carried.append(memory.owned(value) if is_there else memory.registers(value))
-        # A loop may carry the same array twice. Because of `hold`, it gets two copies.
+        # If a loop carries the same array twice, `hold` makes `owned` copy the second.
         hold(carried[-1])
     for value in carried:
         release(value)

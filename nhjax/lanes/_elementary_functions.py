@@ -163,7 +163,7 @@ done:
 
 
 def rem(x: Value, y: Value) -> Value:
-    """Return x - y trunc(x / y), which is exact."""
+    """Return x - y trunc(x / y), computed without error."""
     a, b = absolute(x), absolute(y)
     ratio = a / b
     whole, _ = nearest(ratio)

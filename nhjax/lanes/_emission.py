@@ -45,8 +45,8 @@ from ._writer import (
 _ALIGNMENT = 64
 _LARGEST_STACK = 2**16
 _LARGEST_SCRATCH = 2**26
-# If a side of a divergent branch has more nodes than this, it is skipped when no member
-# takes it. Shorter sides are always computed.
+# A side of a divergent branch with more nodes than this, or with one of `_STATEMENTS`,
+# is skipped when no member takes it. Other sides are always computed.
 _LONGEST_SIDE = 24
 _STATEMENTS = ("loop", "branch", "store", "load")
 _ALL = "splat (i1 true)"
@@ -62,7 +62,7 @@ def emit(
     """Write the kernel of a graph.
 
     Returns the text of its module, without the definitions of elementary functions, and
-    the list of these functions, in the form that `definitions` takes.
+    the elementary functions that it calls, in the form that `definitions` takes.
     """
     live = LiveNodes(results)
     if width > 1:
@@ -422,8 +422,8 @@ class _Regions:
     """The writer of regions, with the loops and branches in them.
 
     `mask` is the name of the mask of the members that are running; `None` stands for
-    all members. Regions that no member enters are skipped at run time, except for short
-    sides of divergent branches.
+    all members. Regions that no member enters are skipped at run time, except for sides
+    of divergent branches that are short (see `_is_long`).
     """
 
     def __init__(

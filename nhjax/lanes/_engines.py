@@ -32,11 +32,11 @@ class EngineUse(NamedTuple):
 
     - `engine`: `"lanes"` is nhjax's own compiler, which vectorises over the members of
         an ensemble (SIMD); `"kernels"` is XLA with one kernel for each member; `"xla"`
-        is XLA without such kernels.
+        is XLA with its usual sequence of kernels.
     - `reason`: why this engine was used, and why the engines that are tried before it
         were not used.
     - `members`: the number of members of an ensemble; `None` for a single run, and for
-        a part of a program that is not compiled as a whole.
+        a function that is left to JAX because all of it calls Python or has effects.
     """
 
     engine: str

@@ -139,7 +139,8 @@ def _expansion(function: Callable[..., Any], equation: Any) -> Any:
 def _known_program(
     function: Callable[..., Any], params: tuple[Any, ...], *kinds: Any
 ) -> Any:
-    # Tracing a factorisation takes longer than tracing most functions that contain it.
+    # Traced programs are cached, because tracing a factorisation takes longer than
+    # tracing most functions that contain it.
     return _program(partial(function, **dict(params)), *kinds)
 
 
@@ -149,7 +150,7 @@ def _traced(function: Callable[..., Any], equation: Any) -> Any:
 
 
 def _kinds(equation: Any) -> tuple[Any, Any]:
-    """Return the kinds of the operands, and the kinds of the results."""
+    """Return the shapes and dtypes of the operands, and of the results."""
     operands, results = [x.aval for x in equation.invars], equation.outvars
     return (
         tuple((x.shape, x.dtype, x.weak_type) for x in operands),
@@ -185,9 +186,9 @@ def _contains(jaxpr: Any, primitive: Any) -> bool:
 
 
 def _for_each(function: Callable[..., Any], rank: int) -> Callable[..., Any]:
-    """Return a function that treats the first axes of its operands as members.
+    """Return `function`, vectorised over the leading axes of its operands.
 
-    `rank` is the number of axes of the first operand for one member.
+    `rank` is the number of the remaining axes of the first operand.
     """
 
     def run(*operands: Any, **params: Any) -> Any:

@@ -160,7 +160,7 @@ _TWO_52_BITS = 0x4330000000000000
 
 
 def exponent_and_mantissa(x: Value) -> tuple[Value, Value]:
-    """Return k and m with x = 2^k m, for positive and finite x."""
+    """Return k and m with x = 2^k m, m from sqrt(1/2) to sqrt(2), for finite x > 0."""
     is_small = x < _SMALLEST_NORMAL
     bits = where(is_small, x * 2.0**54, x).bits() + (ONE_BITS - _ROOT_HALF_BITS)
     m = ((bits & _MANTISSA_BITS) + _ROOT_HALF_BITS).number()
@@ -320,7 +320,7 @@ def cbrt(x: Value) -> Value:
     """Return the cube root of x."""
     size = absolute(x)
     k, m = exponent_and_mantissa(size)
-    # |x| = 2^(3q) w with w from 1/2 to 4.
+    # |x| = 2^(3q) w with w from 2^(-3/2) to 2^(3/2).
     q, exponent = nearest(k * (1.0 / 3.0))
     left = k - 3.0 * q
     w = where(left > 0.0, m * 2.0, where(left < 0.0, m * 0.5, m))

@@ -8,8 +8,8 @@ from contextlib import contextmanager
 
 # A large program consists of millions of objects, nearly all of which live as long as
 # the program. By default Python looks for cycles each time that 700 objects have been
-# created. These searches took a third of the time to trace the gradient of a bicycle,
-# and found almost no garbage.
+# created. While the gradient of a run of a bicycle was traced, these searches took a
+# third of the time, and found almost no garbage.
 _OBJECTS = 100_000
 
 _lock = threading.Lock()

@@ -1,9 +1,9 @@
 """The graph of scalar operations of one member, simplified while it is built.
 
 A node is one number or one statement: a store, a loop or a branch. Every node lies in a
-region: the root, the body of a loop, or a side of a branch. Within a region nodes are
-ordered by their numbers, that is, in the order of creation. A node therefore comes
-after its arguments, and a load comes after the stores that it must see.
+region: the root, the body of a loop, a side of a branch, or a function. Within a region
+nodes are ordered by their numbers, that is, in the order of creation. A node therefore
+comes after its arguments, and a load comes after the stores that it must see.
 
 Nodes without side effects are pure. They are hash-consed: an operation with the same
 arguments exists once. A pure node lies in the deepest region of its arguments, so that
@@ -56,7 +56,7 @@ def is_float(dtype: str) -> bool:
 
 
 class Region:
-    """A list of nodes: the root, the body of a loop, or a side of a branch."""
+    """A part of the graph: the root, a loop's body, a branch's side or a function."""
 
     __slots__ = ("depth", "floor", "loads", "owner", "parent", "spills", "table")
 
@@ -641,7 +641,7 @@ class LoopBuilder:
 
 
 def counted_loop(graph: Graph, length: int, body: Callable[[Node], None]) -> None:
-    """Create a loop over a counter from 0 to `length` whose body only stores."""
+    """Create a loop over a counter from 0 to `length` - 1 whose body only stores."""
     if length == 0:
         return
     with LoopBuilder(graph) as loop:
@@ -738,7 +738,7 @@ class Function:
         return is_pure and len(self.nodes) >= _SHORTEST
 
     def structure(self) -> Hashable:
-        """Return a value that is equal for functions that compute the same results."""
+        """Return a key; functions with equal keys compute the same results."""
         places = {node: k for k, node in enumerate(self.parameters)}
 
         def place(node: Node) -> int:

@@ -45,7 +45,7 @@ from ._ffi import (
 )
 
 
-# The shortest work, in ns, for which a helper is woken. Waking it takes about 10 µs.
+# The work, in ns, for which one helper is woken. Waking a helper takes about 10 µs.
 _WORTH_A_HELPER = 50_000
 # The number of times that a waiting caller yields its core before it sleeps, and the
 # limits of a sleep in µs. Between these limits, a sleep takes an eighth of the time

@@ -1,11 +1,11 @@
 """Jaxprs: which operations they contain, and the removal of superfluous operations.
 
-`fits_one_kernel` decides by the kinds and sizes of operations whether XLA can compile a
-program to a single kernel of the CPU. `cse_dce` removes repeated operations
-(common-subexpression elimination) and unused operations (dead-code elimination). A
-traced program repeats many operations, because derivatives also compute the function
-itself. Without `cse_dce`, each transformation and the compiler would process every
-copy.
+`fits_one_kernel` decides, by the operations and the sizes of their arrays, whether XLA
+can compile a program to a single kernel of the CPU. `cse_dce` removes repeated
+operations (common-subexpression elimination) and unused operations (dead-code
+elimination). A traced program repeats many operations, because derivatives also compute
+the function itself. Without `cse_dce`, each transformation and the compiler would
+process every copy.
 """
 
 import itertools
@@ -47,10 +47,11 @@ _MOVING = """
 """.split()  # noqa: SIM905
 ARITHMETIC_AND_SHAPES = (*ELEMENTWISE, *_REDUCING, *_SHAPING, *_MOVING)
 _ARITHMETIC = {"add", "add_any", "div", "mul", "neg", "sub"}
-# nhjax's own operation, which is lowered to broadcasts, a product and a sum.
+# nhjax's own operation, which is lowered to broadcasts, a product and a sum, or to a
+# product and an addition for each term.
 SMALL_PRODUCT = "small_product"
 # nhjax's own operation, which inverts a matrix. Its parameter is the program by which
-# XLA computes it.
+# XLA computes the inverse.
 SMALL_INVERSE = "small_inverse"
 # nhjax's own operation, which writes a row of an array.
 WRITE_ROW = "write_row"

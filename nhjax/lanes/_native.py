@@ -31,8 +31,8 @@ class Target(NamedTuple):
 _PLATFORMS = {("linux", "x86_64"), ("linux", "aarch64"), ("darwin", "arm64")}
 
 # The level of LLVM's passes on the IR. Kernels are already simplified when they are
-# written. Therefore code of level 1 was as fast as code of level 3, and took half of
-# the time to compile. Without passes the code was 5 to 15 percent slower.
+# written. Therefore code of level 1 was as fast as code of level 3, and took half as
+# long to compile. Without passes the code was 5 to 15 percent slower.
 _PASSES = 1
 # A module is short if its text has fewer characters than `_LONG_TEXT`. Short and long
 # modules have different levels of the code generator. Level 1 takes half of the compile
@@ -40,9 +40,9 @@ _PASSES = 1
 # was 2 percent faster.
 _LONG_TEXT = 1_000_000
 _GENERATION_OF_SHORT, _GENERATION_OF_LONG = 2, 1
-# For modules of this length, such as gradients of machines, only a few passes run. The
-# other passes, of which moving invariant operations out of loops is the slowest, took a
-# quarter of the compile time, and made the code only 4 percent faster.
+# For modules of at least this length, such as gradients of machines, only a few passes
+# run. The other passes, of which moving invariant operations out of loops is the
+# slowest, took a quarter of the compile time, and made the code only 4 percent faster.
 _VERY_LONG_TEXT = 4_000_000
 # The level of the passes and of the code generator for programs that must compile
 # quickly: no optimisation.

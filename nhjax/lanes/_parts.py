@@ -32,10 +32,10 @@ def parts(equations: list[Any]) -> Parts:
     """Divide a program so that no operation of the part `inside` calls Python.
 
     If the operands of a call of Python depend on no loop and on at most a quarter of
-    the operations, the call is computed before this part. An example is a check of the
-    program's operands. Other calls of Python, and the operations that depend on them,
-    are computed after the part `inside`. Operations that two parts need are computed
-    twice.
+    the operations, the call is computed before the part `inside`. An example is a check
+    of the program's operands. Other calls of Python, and the operations that depend on
+    them, are computed after the part `inside`. Operations that two parts need are
+    computed twice.
     """
     total = sum(map(_count, equations))
     maker = {x: index for index, e in enumerate(equations) for x in e.outvars}

@@ -94,8 +94,8 @@ def compile_batched(
 
     - `program`: a closed jaxpr, the program of one member.
     - `is_batched`: for each operand, whether its leading axis is the axis of the
-        members. Otherwise all members share it. The leading axis of all results is the
-        axis of the members.
+        members. Otherwise all members share the operand. The leading axis of all
+        results is the axis of the members.
     - `is_brief`: whether to compile in less time, to slower code.
 
     **Returns:** a name for `jax.ffi.ffi_call` and `jax.ffi.ffi_lowering`.
@@ -357,7 +357,7 @@ def _shared_handler() -> int:
     """Return the address of the function that the handlers of all programs call.
 
     Apart from the kernels that it runs, this function takes less than a microsecond.
-    Optimising it would therefore take longer than the time that it saves.
+    Optimising it would therefore take longer than the time saved.
     """
     code = object_code([shared_handler_ir()], SHARED_HANDLER, host(), is_quick=True)
     imports = {WORKERS: ctypes.addressof(_workers)}
@@ -380,12 +380,13 @@ def _name(*texts: str) -> str:
 # The lowering of the operations that stand for programs
 
 
-# This compiler turns all arrays into scalars. Measurements on the gallery's systems
-# with 2 to 8 stages, and on larger systems, show that its code is faster than XLA's if
-# the root mean square of array sizes is at most `_SMALL_ARRAYS`. For larger arrays XLA
-# is often faster, since it uses vectors for operations on arrays even in a single run.
-# But XLA takes more than 1 ms to compile an operation. Therefore, up to `_LARGE_ARRAYS`
-# XLA compiles only short programs. Above this size it compiles all programs.
+# This compiler turns operations on arrays into operations on scalars. Measurements on
+# the gallery's systems with 2 to 8 stages, and on larger systems, show that its code is
+# faster than XLA's if the root mean square of array sizes is at most `_SMALL_ARRAYS`.
+# For larger arrays XLA is often faster, since it uses vectors for operations on arrays
+# even in a single run. But XLA takes more than 1 ms to compile an operation. Therefore,
+# up to `_LARGE_ARRAYS`, XLA compiles only short programs. Above this size it compiles
+# all programs.
 _SMALL_ARRAYS, _LARGE_ARRAYS = 40, 110
 _SHORT_PROGRAM = 2800
 # A program can have large arrays in operations that are computed once in each step, and

@@ -134,7 +134,7 @@ def jit(fun: Callable[..., Any]) -> Callable[..., Any]:
     **Arguments:**
 
     - `fun`: a function of arrays and trees of arrays. As with `jax.jit`, it is traced
-        once for each kind of arguments.
+        once for each combination of shapes and dtypes of its arguments.
 
     **Returns:**
 

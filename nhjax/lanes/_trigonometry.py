@@ -69,7 +69,7 @@ def _window(exponent: Value) -> list[Value]:
 def _reduction_of_large() -> str:
     """Return the definition of a function of x that returns n and r as a double-double.
 
-    As for small arguments, x is n pi / 2 + r up to multiples of 2 pi.
+    x equals n pi / 2 + r up to a multiple of 2 pi.
     """
     writer = Writer(1)
     bits = Value(writer, "double", "%x").bits()

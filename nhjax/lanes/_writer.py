@@ -502,7 +502,7 @@ def leading_bits(x: Value, count: int) -> Value:
 
 
 def halves(x: Value) -> DoubleDouble:
-    """Split x into two numbers of 26 bits, such that their products are exact."""
+    """Split x into two numbers of 26 bits: products of such numbers are exact."""
     with x.writer.exact():
         upper = leading_bits((x.bits() + _HALF_UNIT).number(), 26)
         return upper, x - upper

@@ -29,7 +29,7 @@ def animate(
     frame_rate: float = 25.0,
     ax: "Axes | None" = None,
 ) -> "FuncAnimation":
-    """Animate a machine in the plane or in space, at the speed of its motion.
+    """Animate a machine in the plane or in space, by default in real time.
 
     Positions are interpolated linearly between the saved times, so that the frame rate
     is constant for any step sizes. Save the animation with
@@ -43,9 +43,9 @@ def animate(
     - `points`: a dictionary from names to saved positions. A point has shape (times, 2)
         or (times, 3). The outline of a body has shape (times, corners, 2) or (times,
         corners, 3), and is filled. The machines of `nhjax.systems` have a method
-        `points`. `SaveAt(fn=lambda t, y, args: machine.points(t, y.q))` saves its
-        results during a run. From saved states, compute them by
-        `jax.vmap(machine.points)(sol.ts, sol.ys.q)`.
+        `points`. To save its points during a run, use
+        `SaveAt(fn=lambda t, y, args: machine.points(t, y.q))`. To compute the points
+        from saved states, use `jax.vmap(machine.points)(sol.ts, sol.ys.q)`.
     - `rods`: chains of points that are connected by lines, each a tuple of names such
         as `("hub", "end")`.
     - `wheels`: for each wheel the names of its hub and of a point of its rim, and in
@@ -53,7 +53,7 @@ def animate(
         hub to the point of the rim. If this point is fixed in the wheel, the line shows
         how the wheel turns.
     - `traced`: the names of points whose past paths are drawn.
-    - `ground`: the height of the ground, which is drawn below the machine.
+    - `ground`: the height at which the ground is drawn. By default no ground is drawn.
     - `follow`: the name of a point that stays in the centre of the picture. By default
         the picture does not move.
     - `speed`: the number of seconds of the motion in one second of the animation.

@@ -180,7 +180,7 @@ def multiplier(sol: Solution, *, ax: "Axes | None" = None, **style: Any) -> "Axe
 
     **Returns:** the axes.
 
-    **Raises:** `ValueError` if `sol` has no states.
+    **Raises:** `ValueError` if `sol` has no states, or the system has no constraints.
     """
     ts, ys = saved_states(sol)
     values = np.asarray(ys.multiplier)
@@ -214,7 +214,7 @@ def constraint(
 
     **Returns:** the axes.
 
-    **Raises:** `ValueError` if `sol` has no states.
+    **Raises:** `ValueError` if `sol` has no states, or the system has no constraints.
     """
     check_is_system(system)
     ts, ys = saved_states(sol)
@@ -247,7 +247,7 @@ def convergence(
     **Arguments:**
 
     - `step_sizes`, `errors`: vectors of the same length; errors that are not positive
-        are ignored.
+        or not finite are ignored.
     - `order`: the slope of a dashed reference line. The line is drawn below the errors
         and labelled with its slope.
     - `ax`: the axes to draw into.

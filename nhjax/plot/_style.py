@@ -39,8 +39,8 @@ def style(*, dark: bool = False) -> contextlib.ExitStack:
     end of the block.
 
     Without a call of `style`, the functions of `nhjax.plot` use the light style for the
-    figures that they create. They do not change a setting that differs from
-    matplotlib's default: you have set it, for instance by `style(dark=True)`.
+    figures that they create. They keep each setting that differs from matplotlib's
+    default, because you have set it, for instance by `style(dark=True)`.
 
     **Arguments:**
 

@@ -20,7 +20,7 @@ QUICK: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         "cvt-energy": {"final_time": 200.0, "dt": (0.1,)},
         "chaotic-energy": {"stages": (2,), "final_time": 40.0, "members": 20},
         "unicycle-order": {"stages": (2, 3), "dt": (0.25, 0.125)},
-        # The ball moves once around its circle in one fifth of this run.
+        # In each fifth of these runs the ball moves at least once around its circle.
         "ball-invariants": {"stages": (3,), "dt": (0.2, 0.1), "num_steps": 1000},
     }
 )
@@ -137,7 +137,7 @@ def _estimated_time(name: str, chosen: Mapping[str, Any]) -> str:
     steps = [chosen.get("num_steps", length / h if h > 0 else 0) for h in dt]
     trajectories = chosen.get("members", 0) + 1
     trajectories *= len(chosen.get("regimes", ("",)))
-    # The time of an iteration is proportional to s.
+    # The time of a step is proportional to s, and `step_seconds` holds for s = 2.
     runs = step_seconds * sum(steps) * trajectories * sum(stages) / 2
     seconds = _START_SECONDS + compile_seconds * programs + runs
     if not math.isfinite(seconds):

@@ -57,8 +57,8 @@ class BallRun:
     - `integrals`: shape (k + 1, 4), the three linear first integrals and the moving
         energy.
     - `positions`: the horizontal position (x, y) of the ball, of shape (k + 1, 2).
-    - `circle_deviation`: the distance from the exact position at the common final time
-        of all step sizes.
+    - `circle_deviation`: the distance from the exact position when the run with the
+        smallest step ends.
     - `timing`: the times to compile and to run one program, which runs all step sizes
       with this s in one `jax.vmap`.
     """
@@ -247,13 +247,13 @@ def ball_invariants(
 ) -> BallInvariants:
     """Compute the first integrals of the homogeneous ball on a turntable.
 
-    This is the fifth experiment of the paper. For one step size, three stages and the
-    Cayley map, the paper plots the errors of the four first integrals against time.
-    Three of the integrals are linear. They are conserved to the tolerance of the
-    nonlinear solver, which is 1e-12 in the paper and round-off here. The error of the
-    fourth integral, the moving energy, oscillates like the energy error of a holonomic
-    system. In addition, this study measures whether the error of the moving energy
-    stays bounded, the order of this error, and the distance of the ball from its exact
+    This is the fifth experiment of the paper. For one step size, s = 3 and the Cayley
+    map, the paper plots the errors of the four first integrals against time. Three of
+    the integrals are linear. They are conserved to the tolerance of the nonlinear
+    solver, which is 1e-12 in the paper and round-off here. The error of the fourth
+    integral, the moving energy, oscillates like the energy error of a holonomic system.
+    In addition, this study measures whether the error of the moving energy stays
+    bounded, the order of this error, and the distance of the ball from its exact
     position on a circle. The paper does not state the data of its example; this study
     uses the data of `nhjax.systems.TurntableBall`, a solid ball whose constraints are
     written in terms of the spatial angular velocity.

@@ -198,7 +198,7 @@ class ChaoticEnergy(AbstractStudyResult):
         return f"μ scales as {found}, averaged over the times"
 
     def figures(self) -> "dict[str, Figure]":
-        """Draw μ against time, divided by the measured and the paper's power of h."""
+        """Draw μ against time, divided by h^{4(s-1)} and by the paper's power of h."""
         title = f"J = {self.members}, {self.closure} closure"
         return {self.name: _figure(self.runs, title)}
 
@@ -295,7 +295,7 @@ class _Case(NamedTuple):
 def _program(
     case: _Case, members: int, every: int, weights: np.ndarray
 ) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-    """Create the run of a member, and the function from an index to the member."""
+    """Create the run of a member, and the function from an index to initial data."""
     chaotic = ChaoticSystem()
 
     def member(j: Array) -> tuple[Array, Array]:
@@ -387,8 +387,8 @@ _REDUCTIONS = {
 def _figure(runs: list[ChaoticRun], title: str) -> "Figure":
     """Draw μ against time with standard errors, in a column for each s.
 
-    In the upper row μ is divided by the measured power of h, and in the lower row by
-    the power of h in the paper.
+    In the upper row μ is divided by h^{4(s-1)}, and in the lower row by the power of h
+    in the paper's figure.
     """
     from matplotlib.figure import Figure
 

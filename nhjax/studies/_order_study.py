@@ -1,8 +1,7 @@
 """Orders of convergence on systems with an exact solution.
 
-`particle_order` and `unicycle_order` are two studies of one kind: both integrate to a
-final time with several numbers of stages and step sizes, and compare the end of each
-run with the exact solution.
+`particle_order` and `unicycle_order` integrate to a final time with several numbers of
+stages and step sizes, and compare the end of each run with the exact solution.
 """
 
 import dataclasses
@@ -97,7 +96,7 @@ class AbstractOrderStudy(AbstractStudyResult):
     timings: list[Timing]
 
     def slopes(self) -> np.ndarray:
-        """Return observed orders, of the shape of `errors`, or NaN at round-off."""
+        """Return observed orders in the shape of `errors`; undefined orders are NaN."""
         # The errors of a run to T = 3 stagnate below 1e-14.
         return np.stack([slopes(self.dt, e, floor=1e-13) for e in self.errors])
 

@@ -1,4 +1,4 @@
-"""The gallery: mechanical systems with their references, one file each."""
+"""The gallery: mechanical systems with their references."""
 
 from ._andrews_squeezer import AndrewsSqueezer as AndrewsSqueezer
 from ._appell import Appell as Appell

@@ -21,8 +21,8 @@ class Appell(AbstractConstrainedExample):
 
     Φ is homogeneous and nonlinear in the velocities. By Chetaev's rule the reaction is
     λ D2Φ, with the derivative D2Φ of Φ with respect to the velocities. The particle
-    falls along a straight line with acceleration g/(1 + κ²). At ż = 0 the constraint is
-    singular, because D2Φ is zero there.
+    falls along a straight line with the vertical acceleration g/(1 + κ²). At ż = 0 the
+    constraint is singular, because D2Φ is zero there.
 
     **Parameters:** `mass` m [kg], `gravity` g [m/s²], `ratio` κ [1].
 

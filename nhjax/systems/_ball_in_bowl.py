@@ -29,16 +29,17 @@ class BallInBowl(AbstractConstrainedGroupExample):
     """A ball that rolls without slipping in a bowl that turns about the vertical.
 
     ℓ = m/2 |ẋ|² + k m a²/2 |ω|² - m g z,  Φ = z - κ/2 (x² + y² + ε z²),
-    φ = (ẋ - a (R ω) × n - Ω e₃ × (x - a n))₁₂,  n = ∇Φ/|∇Φ|,
+    φ = (ẋ - a (R ω) × n - Ω e₃ × (x - a n))₁₂,  n = ∇Φ/|∇Φ|.
 
-    on SO(3) x R³, with q = (R, (x, y, z)): the attitude quaternion and the position of
-    the centre of the ball [m]. This position is the vector x in φ. The velocity is
-    v = (ω₁, ω₂, ω₃, ẋ, ẏ, ż), with the body angular velocity ω [1/s]. The centre moves
-    on Φ = 0. This surface is a paraboloid (ε = 0) or a sphere of radius 1/κ (ε = 1),
-    with its lowest point at the origin. The bowl is parallel to this surface, at the
-    distance a below it; n is the normal of both. The constraints φ are affine. They
-    mean that the ball does not slip at the contact x - a n. With the multipliers
-    (λ₁, λ₂, μ) the force of the bowl is (λ₁, λ₂, 0) + μ ∇Φ [N].
+    The group is SO(3) x R³. Its element q = (R, (x, y, z)) consists of the attitude
+    quaternion and the position of the centre of the ball [m]. This position is the
+    vector x in φ. The velocity is v = (ω₁, ω₂, ω₃, ẋ, ẏ, ż), with the body angular
+    velocity ω [1/s]. The centre moves on Φ = 0. This surface is a paraboloid (ε = 0) or
+    a sphere of radius 1/κ (ε = 1), with its lowest point at the origin. The bowl is
+    parallel to this surface, at the distance a below it; n is the normal of both. The
+    constraints φ are affine. They mean that the ball does not slip at the contact
+    x - a n. With the multipliers (λ₁, λ₂, μ) the force of the bowl is
+    (λ₁, λ₂, 0) + μ ∇Φ [N].
 
     The energy E is not conserved, but the moving energy
     E - Ω (m (x ẏ - y ẋ) + k m a² (R ω)₃) is conserved. For a flat bowl, κ = 0, the

@@ -22,13 +22,13 @@ class CarAxis(AbstractExample):
     L = ε²M/4 (|ṙ_l|² + |ṙ_r|²) - ½ (|r_l| - l₀)² - ½ (|r_r - b| - l₀)²
     - ε²Mg/2 (y_l + y_r),
 
-    Φ = (b · r_l, |r_l - r_r|² - l²),  b(t) = (√(l² - y_b²), y_b),  y_b = r sin ωt,
+    Φ = (b · r_l, |r_l - r_r|² - l²),  b(t) = (√(l² - y_b²), y_b),  y_b = r sin ωt.
 
-    with q = (x_l, y_l, x_r, y_r) [m]: the positions r_l and r_r of the ends of the
+    Here q = (x_l, y_l, x_r, y_r) [m]: the positions r_l and r_r of the ends of the
     axle. Each end has half of the mass of the chassis. The left wheel stays at the
-    origin, the right wheel is at b. Both constraints are holonomic. The first depends
-    on time, and keeps the left spring perpendicular to the line through the wheels. The
-    stiffness of the springs is 1/ε², and L is multiplied by ε².
+    origin, and the right wheel is at b. Both constraints are holonomic. The first
+    depends on time, and keeps the left spring perpendicular to the line through the
+    wheels. The stiffness of the springs is 1/ε², and L is multiplied by ε².
 
     **Parameters:** `mass` M [kg] of the chassis; `epsilon` ε, whose inverse square is
     the stiffness of the springs; `length` l of the axle, `rest_length` l₀ of the

@@ -24,18 +24,18 @@ from ._planar import direction
 class CarWithTrailers(AbstractNonholonomicExample):
     """A car that pulls n trailers, each with one axle, on R⁴⁺ⁿ.
 
-    L = Σ (m_i/2 |ċ_i|² + I_i/2 θ̇_i²) + J/2 (θ̇₀ + δ̇)²,
+    L = Σ (m_i/2 |ċ_i|² + I_i/2 θ̇_i²) + J/2 (θ̇₀ + δ̇)².
 
-    summed over the car (i = 0) and its trailers, with the centres of mass c_i. The
+    The sum is over the car (i = 0) and its trailers, with the centres of mass c_i. The
     coordinates are q = (x, y, θ₀, δ, θ₁ ... θₙ): the middle of the rear axle [m], the
     heading of the car, the steer angle of the front wheels relative to the car, and the
     headings of the trailers [rad]. The wheels do not slip sideways. With the unit
     vectors e(θ) along a heading θ and n(θ) to its left, the constraints are
 
-    Φ = (n(θ₀)·ṙ₀, n(θ₀ + δ)·ṙ_front, n(θ₁)·ṙ₁ ... n(θₙ)·ṙₙ)
+    Φ = (n(θ₀)·ṙ₀, n(θ₀ + δ)·ṙ_front, n(θ₁)·ṙ₁ ... n(θₙ)·ṙₙ).
 
-    for the rear axle r₀ and the front axle r₀ + L e(θ₀) of the car with the wheelbase
-    L, and the axles r_i = r_{i-1} - h_i e(θ_{i-1}) - d_i e(θ_i) of the trailers. The
+    The car has the wheelbase L, the rear axle r₀ and the front axle r₀ + L e(θ₀). The
+    axles of the trailers are r_i = r_{i-1} - h_i e(θ_{i-1}) - d_i e(θ_i). The
     multipliers are the forces of the ground on the axles, to the left of the wheels.
 
     `args` is None or a pair: the force that drives the car at the rear axle [N] and
@@ -154,8 +154,9 @@ class CarWithTrailers(AbstractNonholonomicExample):
         """Compute the v that satisfies the constraints, given the rear axle's speed.
 
         Let v and θ̇ be the speed and the turning rate of the vehicle in front of a
-        trailer, and β the angle between the two. The trailer turns at the rate
-        (v sin β - h θ̇ cos β)/d, and has the speed v cos β + h θ̇ sin β.
+        trailer, and β the heading of this vehicle minus the heading of the trailer. The
+        trailer turns at the rate (v sin β - h θ̇ cos β)/d, and has the speed
+        v cos β + h θ̇ sin β.
         """
         along, steering = (jnp.asarray(x, q.dtype) for x in (speed, steer_rate))
         heading, steer = q[2], q[3]

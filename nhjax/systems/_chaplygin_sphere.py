@@ -14,11 +14,11 @@ class ChaplyginSphere(AbstractRollingBody):
     """A balanced sphere with three different moments of inertia that rolls on a plane.
 
     ℓ = m/2 |v|² + ½ (I₁ω₁² + I₂ω₂² + I₃ω₃²) - m g z,  Φ = z - r,
-    φ = (R (v - r ω × γ))₁₂,  γ = Rᵀ e₃,
+    φ = (R (v - r ω × γ))₁₂,  γ = Rᵀ e₃.
 
-    with q = (R, x): the attitude quaternion and the position of the centre, which
-    is also the centre of mass [m]; v and ω are the linear and angular velocity along
-    the principal axes [m/s, 1/s]. Φ is the height of the contact, and φ the horizontal
+    Here q = (R, x): the attitude quaternion and the position of the centre, which is
+    also the centre of mass [m]; v and ω are the linear and angular velocity along the
+    principal axes [m/s, 1/s]. Φ is the height of the contact, and φ the horizontal
     velocity there. The multipliers are the components, along the axes of space, of the
     force that the plane exerts on the sphere [N].
 

@@ -20,15 +20,15 @@ class ChaplyginTop(AbstractRollingBody):
     """A loaded sphere that rolls on a plane: Routh's sphere, and Chaplygin's top.
 
     ℓ = m/2 |v|² + ½ (I₁ω₁² + I₂ω₂² + I₃ω₃²) - m g z,  Φ = z + e₃·(R s),
-    φ = (R (v + ω × s))₁₂,  s = a e₃ - r γ,  γ = Rᵀ e₃,
+    φ = (R (v + ω × s))₁₂,  s = a e₃ - r γ,  γ = Rᵀ e₃.
 
-    with q = (R, x): the attitude quaternion and the position of the centre of mass
-    [m]; v and ω are the linear and angular velocity along the principal axes [m/s,
-    1/s]. If the third axis points upward, the centre of mass is at the distance a below
-    the centre of the sphere. The vector from the centre of mass to the contact is s; Φ
-    is the height of the contact, and φ the horizontal velocity there. The multipliers
-    are the components, along the axes of space, of the force that the plane exerts on
-    the sphere [N].
+    Here q = (R, x): the attitude quaternion and the position of the centre of mass [m];
+    v and ω are the linear and angular velocity along the principal axes [m/s, 1/s]. If
+    the third axis points upward, the centre of mass is at the distance a below the
+    centre of the sphere. The vector from the centre of mass to the contact is s; Φ is
+    the height of the contact, and φ the horizontal velocity there. The multipliers are
+    the components, along the axes of space, of the force that the plane exerts on the
+    sphere [N].
 
     If I₁ = I₂, the body is Routh's sphere, which is integrable. Besides the energy, two
     quantities are then conserved: Jellett's integral K·s, with the angular momentum K

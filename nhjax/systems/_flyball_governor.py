@@ -25,9 +25,9 @@ class FlyballGovernor(AbstractExample):
     """A turning shaft with two hinged rods, whose flyballs lift a slider on the shaft.
 
     L = (J_s + J_m)/2 φ̇² + m/2 ṡ² - m g s + Σ_{k=1,2} (m_r/2 |ċ_k|² + M/2 |ḃ_k|²
-    + B/2 |u̇_k|² + A/2 φ̇² sin² β_k - g (m_r c_k + M b_k) · e_z) - V,
+    + B/2 |u̇_k|² + A/2 φ̇² sin² β_k - g (m_r c_k + M b_k) · e_z) - V.
 
-    with q = (φ, β₁, β₂, s): the angle of the shaft and the angles of the rods below the
+    Here q = (φ, β₁, β₂, s): the angle of the shaft and the angles of the rods below the
     horizontal [rad], and the height of the slider [m], which turns with the shaft. Each
     rod has the direction u_k = ± cos β_k e(φ) - sin β_k e_z, with the horizontal unit
     vector e(φ), and its hinge p_k is at the radius a and the height h. The centre of
@@ -180,7 +180,7 @@ class FlyballGovernor(AbstractExample):
         return driving + resisting
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Compute the vertical angular momentum and, with rigid rods, the energy."""
+        """Compute the vertical angular momentum and, without springs, the energy."""
         momentum = jax.grad(self.lagrangian, argnums=2)(t, q, v, None)
         conserved = {"vertical_momentum": momentum[0]}
         if self.couplers == "springs":

@@ -25,16 +25,16 @@ class FourBar(AbstractExample):
     """A crank, a coupler and a rocker that close a loop with the ground.
 
     L = Σ (m_k/2 |ċ_k|² + I_k/2 θ̇_k² - m_k g y_k),
-    Φ = l₁ e(θ₁) + l₂ e(θ₂) - l₃ e(θ₃) - (l₄, 0),  Q = (M, 0, 0),
+    Φ = l₁ e(θ₁) + l₂ e(θ₂) - l₃ e(θ₃) - (l₄, 0),  Q = (M, 0, 0).
 
-    with q = (θ₁, θ₂, θ₃), the angles of crank, coupler and rocker from the horizontal
+    Here q = (θ₁, θ₂, θ₃), the angles of crank, coupler and rocker from the horizontal
     [rad], and e(θ) = (cos θ, sin θ). The crank turns about the origin, the rocker about
     (l₄, 0). Each bar is uniform, with the moment of inertia I = m l²/12 about its
     centre c, which is at the height y. The default is a crank-rocker, whose crank makes
     full turns, with bars of 1 kg/m.
 
-    **Parameters:** `lengths` (l₁, l₂, l₃, l₄) [m], where l₄ is the distance of the two
-    fixed joints; `masses` (m₁, m₂, m₃) [kg]; `gravity` g [m/s²]; `torque` M on the
+    **Parameters:** `lengths` (l₁, l₂, l₃, l₄) [m], where l₄ is the distance between the
+    two fixed joints; `masses` (m₁, m₂, m₃) [kg]; `gravity` g [m/s²]; `torque` M on the
     crank [N m].
 
     **Source:** García de Jalón and Bayo, *Kinematic and Dynamic Simulation of Multibody
@@ -96,7 +96,7 @@ class FourBar(AbstractExample):
 
     @classmethod
     def parallelogram(cls) -> "FourBar":
-        """Create the benchmark: one loop of bars that have 1 m and 1 kg each.
+        """Create the benchmark: one loop of bars of 1 m and 1 kg each.
 
         At the start the crank is upright, and its end moves to the right at 1 m/s. When
         all bars are horizontal, first after 0.71 s, the constraints are dependent, and

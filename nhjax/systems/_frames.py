@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 
 class Frame(NamedTuple):
-    """A rigid motion: a point c of the body is at origin + rotation c in space.
+    """A rigid motion: a point c of the body is at `origin + rotation @ c` in space.
 
     The rate of a motion is a `Frame` too, with the time derivatives of both parts.
     """

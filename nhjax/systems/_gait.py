@@ -14,7 +14,7 @@ from ._base import AbstractNonholonomicExample, coordinates
 
 
 class Sinusoid(eqx.Module):
-    """One joint angle, or an array of angles, a sin(ωt + β) as a function of time."""
+    """One joint angle or an array of angles: the function a sin(ωt + β) of time."""
 
     amplitude: Array = eqx.field(converter=coordinates)
     rate: Array = eqx.field(converter=coordinates)

@@ -19,11 +19,12 @@ from ._base import (
 class HeavyTop(AbstractExample):
     """A rigid body under gravity that turns about a fixed pivot, the origin, on SO(3).
 
-    ℓ = m/2 |ω × X|² + ½ (J₁ω₁² + J₂ω₂² + J₃ω₃²) - m g e₃·(R X),
+    ℓ = m/2 |ω × X|² + ½ (J₁ω₁² + J₂ω₂² + J₃ω₃²) - m g e₃·(R X).
 
-    with the attitude quaternion q of the rotation R, the body angular velocity ω along
-    the principal axes, and the centre of mass X in the body, seen from the pivot. If
-    J₁ = J₂ and X lies on the third axis, as by default, the body is Lagrange's top.
+    Here q is the attitude quaternion of the rotation R, ω is the body angular velocity
+    along the principal axes, and X is the vector from the pivot to the centre of mass
+    in body axes. If J₁ = J₂ and X lies on the third axis, as by default, the body is
+    Lagrange's top.
 
     **Parameters:** `mass` m [kg], `moments` (J₁, J₂, J₃) about the centre of mass
     [kg m²], `centre` X [m], `gravity` g [m/s²]; `retraction`, the retraction of SO(3).
@@ -110,13 +111,13 @@ class HeavyTop(AbstractExample):
 class HeavyTopSE3(AbstractExample):
     """The heavy top as a body in space whose pivot is held by constraints, on SE(3).
 
-    ℓ = m/2 |v|² + ½ (J₁ω₁² + J₂ω₂² + J₃ω₃²) - m g e₃·x,  Φ = x - R X,
+    ℓ = m/2 |v|² + ½ (J₁ω₁² + J₂ω₂² + J₃ω₃²) - m g e₃·x,  Φ = x - R X.
 
-    with q = (R, x): the attitude quaternion and the position of the centre of mass; v
-    and ω are the linear and angular velocity in body axes. X is the centre of mass in
-    the body, seen from the pivot. The three constraints are holonomic, and their
-    multipliers are the components of the force of the pivot in space. The body moves
-    like `HeavyTop` with the same parameters.
+    Here q = (R, x): the attitude quaternion and the position of the centre of mass; v
+    and ω are the linear and angular velocity in body axes. X is the vector from the
+    pivot to the centre of mass in body axes. The three constraints are holonomic, and
+    their multipliers are the components, along the axes of space, of the force of the
+    pivot on the body. The body moves like `HeavyTop` with the same parameters.
 
     **Parameters:** the parameters of `HeavyTop`; `retraction`, the retraction of SE(3).
 

@@ -69,7 +69,7 @@ def attitude_in_space(
     t: float,
     rate: float,
 ) -> np.ndarray:
-    """Compute the attitude R(t) of a body whose spatial angular velocity is known."""
+    """Compute the attitude at `t` of a body whose spatial angular velocity is known."""
 
     def matrix(times):
         return 0.5 * _product_matrix(space_velocity(times), -1.0)

@@ -12,7 +12,7 @@ from ._base import AbstractExample, coordinates, parameter, require_positive
 
 
 class HarmonicOscillator(AbstractExample):
-    """An isotropic harmonic oscillator in any number of dimensions, unconstrained.
+    """An isotropic harmonic oscillator in any dimension, without constraints.
 
     L = m/2 |v|² - k/2 |q|².
 

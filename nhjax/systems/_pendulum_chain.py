@@ -20,10 +20,11 @@ from ._base import (
 class PendulumChain(AbstractExample):
     """Point masses on rods in a vertical plane; each rod hangs from the previous mass.
 
-    L = Σ m_k (½ |ṙ_k|² - g y_k),  Φ_k = |r_k - r_{k-1}|² - l_k²,  k = 1, ..., n,
+    L = Σ m_k (½ |ṙ_k|² - g y_k),  Φ_k = |r_k - r_{k-1}|² - l_k²,  k = 1, ..., n.
 
-    with q = (x₁, y₁, ..., x_n, y_n) [m], y upwards, and the pivot r₀ = 0. There are n
-    holonomic constraints on 2n coordinates. A chain with many links is a discrete rope.
+    Here q = (x₁, y₁, ..., x_n, y_n) [m], y upwards, and the pivot is r₀ = 0. There are
+    n holonomic constraints on 2n coordinates. A chain with many links is a discrete
+    rope.
 
     **Parameters:** `num_links` n, static; `masses` m_k [kg] and `lengths` l_k [m], each
     one number for all links or an array of shape (n,); `gravity` g [m/s²]. By default
@@ -125,7 +126,7 @@ class PendulumChain(AbstractExample):
 
 
 def _one_each(number: int, name: str, value: ArrayLike | tuple[float, ...]) -> Array:
-    """Convert one value for all links, or an array, to an array of all links."""
+    """Convert one value for all links, or an array, to one value for each link."""
     array = coordinates(value)
     if array.shape == ():
         return jnp.full((number,), array)

@@ -24,17 +24,16 @@ class Rattleback(AbstractRollingBody):
     """A stone, an ellipsoid with skew axes of inertia, that rolls on a plane.
 
     ℓ = m/2 |v|² + ½ ω·(J ω) - m g z,  Φ = z + e₃·(R s),  φ = (R (v + ω × s))₁₂,
-    s = h e₃ - A γ / √(γ·(A γ)),  A = diag(a², b², c²),  γ = Rᵀ e₃,
+    s = h e₃ - A γ / √(γ·(A γ)),  A = diag(a², b², c²),  γ = Rᵀ e₃.
 
-    with q = (R, x): the attitude quaternion and the position of the centre of mass
-    [m]; v and ω are the linear and angular velocity in body axes [m/s, 1/s]. The body
-    axes are the axes of the ellipsoid; at rest, the third axis points upward. The
-    vector from the centre of mass to the lowest point is s. Φ is the height of this
-    point, and φ the horizontal velocity there. The multipliers are the components,
-    along the axes of space, of the force that the plane exerts on the body [N]. The
-    third axis is a principal axis of inertia, but the other two axes are not. Therefore
-    a spin in one sense turns into rocking, and the rocking into a spin in the other
-    sense.
+    Here q = (R, x): the attitude quaternion and the position of the centre of mass [m];
+    v and ω are the linear and angular velocity in body axes [m/s, 1/s]. The body axes
+    are the axes of the ellipsoid; at rest, the third axis points upward. The vector
+    from the centre of mass to the lowest point is s. Φ is the height of this point, and
+    φ the horizontal velocity there. The multipliers are the components, along the axes
+    of space, of the force that the plane exerts on the body [N]. The third axis is a
+    principal axis of inertia, but the other two axes are not. Therefore a spin in one
+    sense turns into rocking, and the rocking into a spin in the other sense.
 
     With `damping` σ the air exerts the torque -σω, and energy is not conserved.
 

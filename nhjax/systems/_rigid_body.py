@@ -22,10 +22,12 @@ from ._linear_flow import attitude
 
 
 class FreeRigidBody(AbstractExample):
-    """A rigid body that turns freely about its centre of mass, on SO(3), unconstrained.
+    """A rigid body that turns freely about its centre of mass, on SO(3).
 
-    ℓ = ½ (I₁ω₁² + I₂ω₂² + I₃ω₃²), with the attitude quaternion q and the body angular
-    velocity ω along the principal axes.
+    ℓ = ½ (I₁ω₁² + I₂ω₂² + I₃ω₃²).
+
+    Here q is the attitude quaternion, and ω is the body angular velocity along the
+    principal axes.
 
     **Parameters:** `moments` (I₁, I₂, I₃), the principal moments of inertia [kg m²];
     `retraction`, the retraction of SO(3).

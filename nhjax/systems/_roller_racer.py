@@ -25,9 +25,9 @@ class RollerRacer(AbstractGaitMachine):
     """Two bodies with one axle each, joined by a pivot that the rider swings.
 
     L = m₁/2 |ṙ₁|² + I₁/2 θ̇² + m₂/2 |ṙ₂|² + I₂/2 (θ̇ + φ̇)²,
-    Φ = (n₁ · ṙ₁, n₂ · ṙ₂),  r₂ = r₁ + d₁ e(θ) + d₂ e(θ + φ),
+    Φ = (n₁ · ṙ₁, n₂ · ṙ₂),  r₂ = r₁ + d₁ e(θ) + d₂ e(θ + φ).
 
-    with q = (x, y, θ, φ): the position r₁ = (x, y) [m] of the axle of the seat, the
+    Here q = (x, y, θ, φ): the position r₁ = (x, y) [m] of the axle of the seat, the
     heading θ [rad] of the seat, and the angle φ [rad] of the handlebar relative to the
     seat. The unit vector at the angle α is e(α); n₁ and n₂ are the unit vectors across
     the two bodies. The centres of mass lie at the axles, d₁ behind and d₂ ahead of the
@@ -140,7 +140,10 @@ class RollerRacer(AbstractGaitMachine):
         return jnp.zeros_like(v).at[3].set(torque)
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Compute the energy, which is conserved without a gait or a torque."""
+        """Compute the energy, which is conserved without torque.
+
+        With a gait there are no conserved quantities.
+        """
         return {} if self.gait is not None else {"energy": self.energy(t, q, v)}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:

@@ -23,20 +23,20 @@ Twist = Float[Array, "6"]
 class AbstractRollingBody(AbstractConstrainedGroupExample):
     """A rigid body that rolls without slipping on the plane z = 0, on SE(3).
 
-    ℓ = m/2 |v|² + ½ ω·(J ω) - m g z,  Φ = z + e₃·(R s),  φ = (R (v + ω × s))₁₂,
+    ℓ = m/2 |v|² + ½ ω·(J ω) - m g z,  Φ = z + e₃·(R s),  φ = (R (v + ω × s))₁₂.
 
-    with q = (R, x): the attitude quaternion and the position of the centre of mass
-    [m]; v and ω are the linear and angular velocity in body axes [m/s, 1/s]. The vector
-    from the centre of mass to the lowest point is s, in body axes. Φ is the height of
-    this point, and φ the horizontal velocity of the body there. The multipliers are the
-    two horizontal components and the normal component of the force of the plane [N].
+    Here q = (R, x): the attitude quaternion and the position of the centre of mass [m];
+    v and ω are the linear and angular velocity in body axes [m/s, 1/s]. The vector from
+    the centre of mass to the lowest point is s, in body axes. Φ is the height of this
+    point, and φ the horizontal velocity of the body there. The multipliers are the two
+    horizontal components and the normal component of the force of the plane [N].
     """
 
     mass: eqx.AbstractVar[Array]
     retraction: eqx.AbstractVar[AbstractRetraction]
 
     # The weight is a property, because an abstract field `gravity` would become the
-    # second argument of all bodies.
+    # second argument of all subclasses.
     @property
     @abc.abstractmethod
     def weight(self) -> Array:

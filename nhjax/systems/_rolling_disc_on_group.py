@@ -23,10 +23,10 @@ from ._rolling_disc import VerticalRollingDisc
 class RollingDisc(AbstractConstrainedGroupExample):
     """The `VerticalRollingDisc` on SE(2) x SO(2), as a left-invariant system.
 
-    ℓ = m/2 (v₁² + v₂²) + J/2 ω² + I/2 ψ̇²,  φ = (v₁ - Rψ̇, v₂),
+    ℓ = m/2 (v₁² + v₂²) + J/2 ω² + I/2 ψ̇²,  φ = (v₁ - Rψ̇, v₂).
 
-    with q = ((x, y, φ), (ψ,)), φ the heading and ψ the roll angle, and v = (v₁, v₂, ω,
-    ψ̇): v₁ along the heading, v₂ to its left. All four velocities are constant.
+    Here q = ((x, y, φ), (ψ,)) with the heading φ and the roll angle ψ, and v = (v₁, v₂,
+    ω, ψ̇): v₁ along the heading, v₂ to its left. All four velocities are constant.
 
     **Parameters:** `mass` m [kg], `roll_inertia` I about the axle and
     `heading_inertia` J about the vertical [kg m²], `radius` R [m]; `retraction`, the

@@ -22,15 +22,14 @@ class RollingTorus(AbstractRollingBody):
     """A torus (a wheel, a hoop or a disc) that rolls and tilts on a plane.
 
     ℓ = m/2 |v|² + ½ (I (ω₁² + ω₂²) + J ω₃²) - m g z,  Φ = z + e₃·(R s),
-    φ = (R (v + ω × s))₁₂,  s = -r γ - a (γ₁, γ₂, 0)/√(γ₁² + γ₂²),  γ = Rᵀ e₃,
+    φ = (R (v + ω × s))₁₂,  s = -r γ - a (γ₁, γ₂, 0)/√(γ₁² + γ₂²),  γ = Rᵀ e₃.
 
-    with q = (R, x): the attitude quaternion and the position of the centre [m]; v and
-    ω are the linear and angular velocity in body axes [m/s, 1/s], and the third body
-    axis is the axle. The vector from the centre to the lowest point is s; Φ is the
-    height of this point, and φ the horizontal velocity there. The multipliers are the
-    components, along the axes of space, of the force that the plane exerts on the body
-    [N]. With r = 0, the default, the body is a disc of zero thickness: Euler's disc
-    without slip.
+    Here q = (R, x): the attitude quaternion and the position of the centre [m]; v and ω
+    are the linear and angular velocity in body axes [m/s, 1/s], and the third body axis
+    is the axle. The vector from the centre to the lowest point is s; Φ is the height of
+    this point, and φ the horizontal velocity there. The multipliers are the components,
+    along the axes of space, of the force that the plane exerts on the body [N]. With
+    r = 0, the default, the body is a disc of zero thickness: Euler's disc without slip.
 
     The axle must not be vertical, because the lowest point is then not unique. In a
     steady motion the tilt is constant, and the centre moves on a circle or rests;

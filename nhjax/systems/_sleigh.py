@@ -22,12 +22,12 @@ class ChaplyginSleigh(AbstractConstrainedExample):
     """A rigid body on a horizontal plane, supported by a blade and smooth slides.
 
     L = m/2 [(ẋ - aθ̇ sin θ)² + (ẏ + aθ̇ cos θ)²] + J/2 θ̇²,
-    Φ = -sin θ ẋ + cos θ ẏ,  q = (x, y, θ),
+    Φ = -sin θ ẋ + cos θ ẏ,  q = (x, y, θ).
 
-    with (x, y) the contact of the blade, so that the mass matrix depends on θ. With the
-    speed u along the blade and I = J + ma², the equations of motion are u̇ = aθ̇² and
-    Iθ̈ = -mauθ̇. Therefore every motion tends to a straight motion with the centre of
-    mass in front.
+    Here (x, y) is the contact of the blade, so that the mass matrix depends on θ. With
+    the speed u along the blade and I = J + ma², the equations of motion are u̇ = aθ̇²
+    and Iθ̈ = -mauθ̇. Therefore, if a ≠ 0, every motion that turns tends to a straight
+    motion with the centre of mass in front.
 
     **Parameters:** `mass` m [kg], `inertia` J about the centre of mass [kg m²],
     `offset` a of the centre of mass ahead of the blade [m].

@@ -26,9 +26,9 @@ class Snakeboard(AbstractGaitMachine):
 
     L = m/2 (ẋ² + ẏ²) + J/2 θ̇² + J_r/2 (θ̇ + ψ̇)² + J_w/2 ((θ̇ + φ̇_b)² + (θ̇ + φ̇_f)²),
     Φ = (-sin(θ + φ_b) ẋ + cos(θ + φ_b) ẏ - l cos φ_b θ̇,
-         -sin(θ + φ_f) ẋ + cos(θ + φ_f) ẏ + l cos φ_f θ̇),
+         -sin(θ + φ_f) ẋ + cos(θ + φ_f) ẏ + l cos φ_f θ̇).
 
-    with q = (x, y, θ, ψ, φ_b, φ_f): the centre [m] and heading [rad] of the board, and
+    Here q = (x, y, θ, ψ, φ_b, φ_f): the centre [m] and heading [rad] of the board, and
     the angles of rotor, rear and front axle relative to the board [rad]. The axles are
     at the distance l behind and ahead of the centre, and do not slip sideways. If
     φ_b = φ_f = π/2, the constraints are dependent.

@@ -27,9 +27,9 @@ class SpatialSliderCrank(AbstractExample):
     - m_c g r/2 cos θ,
 
     Φ = s - l e(α, β) - p(θ),  e = (cos β, sin α sin β, -cos α sin β),
-    p = (0, y₀ - r sin θ, z₀ + r cos θ),  s = (x, 0, 0),
+    p = (0, y₀ - r sin θ, z₀ + r cos θ),  s = (x, 0, 0).
 
-    with q = (θ, α, β, x): the angle of the crank about its axle, the two angles of the
+    Here q = (θ, α, β, x): the angle of the crank about its axle, the two angles of the
     universal joint at the slider [rad], and the place of the slider [m]. The axle is
     parallel to the x-axis. The rod has the angular velocity
     ω = (α̇ cos β, β̇, α̇ sin β) in its own axes, of which the first is e. The rod ends

@@ -64,7 +64,7 @@ class SphericalPendulum(AbstractExample):
         length: ArrayLike = 1.0,
         gravity: ArrayLike = 1.0,
     ) -> "SphericalPendulum":
-        """Create a pendulum at `angle` to the downward vertical and at an azimuth."""
+        """Create a pendulum at `angle` to the downward vertical and at `azimuth`."""
         sin, cos = jnp.sin(parameter(angle)), jnp.cos(parameter(angle))
         east, north = jnp.cos(parameter(azimuth)), jnp.sin(parameter(azimuth))
         swing, turn = cos * parameter(angle_rate), sin * parameter(azimuth_rate)
@@ -109,7 +109,7 @@ class SphericalPendulum(AbstractExample):
         height = _height(q0, v0, length, g)
 
         def matrix(times):
-            # 2λ/m = (3gz - 2E)/l², from the tension of the rod on this orbit.
+            # The tension of the rod gives 2λ/m = (3gz - 2E)/l², with the energy mE.
             stiffness = (3 * g * height(times)[0] - 2 * energy) / length**2
             zero, one = np.zeros_like(stiffness), np.ones_like(stiffness)
             return np.moveaxis(np.array([[zero, one], [stiffness, zero]]), -1, 0)

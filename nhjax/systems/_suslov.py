@@ -23,12 +23,12 @@ from ._sleigh import _sech as sech
 class Suslov(AbstractConstrainedGroupExample):
     """A rigid body that cannot turn about an axis fixed in the body, on SO(3).
 
-    ℓ = ½ ω·Iω,  φ = ω₃,
+    ℓ = ½ ω·Iω,  φ = ω₃.
 
-    with the attitude quaternion q and the body angular velocity ω. The body axes are
-    chosen so that I₁₂ = 0. If the axis e₃ is not a principal axis, every motion tends
-    to a steady rotation about an axis in the plane of e₁ and e₂: these rotations are
-    attracting, although energy is conserved.
+    Here q is the attitude quaternion, and ω is the body angular velocity. The body axes
+    are chosen so that I₁₂ = 0. If the fixed axis, e₃, is not a principal axis, every
+    motion tends to a steady rotation about an axis in the plane of e₁ and e₂: these
+    rotations are attracting, although energy is conserved.
 
     **Parameters:** `moments` (I₁₁, I₂₂, I₃₃) and `products` (I₁₃, I₂₃) of inertia
     [kg m²]; `retraction`, the retraction of SO(3).

@@ -25,13 +25,13 @@ class TurntableBall(AbstractConstrainedGroupExample):
     """A ball that rolls without slipping on a turning horizontal table.
 
     ℓ = ½ (v_x² + v_y²) + r²/2 (a ω₁² + b ω₂² + c ω₃²),
-    φ = (v_x + Ωy - r ω_η, v_y - Ωx + r ω_ξ),
+    φ = (v_x + Ωy - r ω_η, v_y - Ωx + r ω_ξ).
 
-    on SO(3) x R², with q = (R, (x, y)): the attitude quaternion and the position of the
-    centre of the ball; v = (ω₁, ω₂, ω₃, v_x, v_y) with the body angular velocity ω. The
-    centre of mass is the centre of the ball, and the mass of the ball is one. The
-    constraints are affine, so that the energy E is not conserved, but the moving energy
-    E - Ω(x v_y - y v_x) is conserved.
+    The group is SO(3) x R². Its element q = (R, (x, y)) consists of the attitude
+    quaternion and the position of the centre of the ball; v = (ω₁, ω₂, ω₃, v_x, v_y)
+    with the body angular velocity ω. The centre of mass is the centre of the ball, and
+    the mass of the ball is one. The constraints are affine, so that the energy E is not
+    conserved, but the moving energy E - Ω(x v_y - y v_x) is conserved.
 
     The constraints contain an angular velocity (ω_ξ, ω_η, ω_ζ), which `frame` selects:
 

@@ -123,7 +123,7 @@ class TwoWheeledRobot(AbstractNonholonomicExample):
         return 0.5 * (moving + turning + self.axle_inertia * (v[3] ** 2 + v[4] ** 2))
 
     def constraint(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Compute Φ, the velocities at which the wheels would slip."""
+        """Compute Φ, the velocities of slip of the wheels."""
         cos, sin = jnp.cos(q[2]), jnp.sin(q[2])
         ahead, aside = v[0] * cos + v[1] * sin, v[1] * cos - v[0] * sin
         swing = self.half_track * v[2]

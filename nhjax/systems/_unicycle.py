@@ -21,10 +21,10 @@ from ._base import (
 class Unicycle(AbstractConstrainedGroupExample):
     """A vertical disc (a unicycle) that a spring binds to the origin, on SE(2).
 
-    ℓ = m/2 (v₁² + v₂²) + I/2 ω² - k/2 (x² + y²),  φ = v₂,
+    ℓ = m/2 (v₁² + v₂²) + I/2 ω² - k/2 (x² + y²),  φ = v₂.
 
-    with q = (x, y, θ) and the body velocity (v₁, v₂, ω): v₁ along the heading, v₂ to
-    its left. The heading turns uniformly.
+    Here q = (x, y, θ), and the body velocity is (v₁, v₂, ω): v₁ along the heading, v₂
+    to its left. The heading turns uniformly.
 
     **Parameters:** `mass` m [kg], `inertia` I about the vertical [kg m²], `spring` k
     [N/m]; `retraction`, the retraction of SE(2).
@@ -179,7 +179,7 @@ class UnicycleInCoordinates(AbstractConstrainedExample):
 def _lagrangian(
     unicycle: Unicycle | UnicycleInCoordinates, q: Array, v: Array
 ) -> Array:
-    # The kinetic energy is the same function of body and of spatial velocities.
+    # The kinetic energy is the same function of the body velocity and of (ẋ, ẏ, θ̇).
     translation = 0.5 * unicycle.mass * (v[0] ** 2 + v[1] ** 2)
     rotation = 0.5 * unicycle.inertia * v[2] ** 2
     return translation + rotation - 0.5 * unicycle.spring * (q[0] ** 2 + q[1] ** 2)

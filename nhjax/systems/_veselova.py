@@ -20,16 +20,16 @@ _INERTIA = ((1.0, 0.1, 0.2), (0.1, 1.4, -0.15), (0.2, -0.15, 0.8))
 class Veselova(AbstractConstrainedGroupExample):
     """A rigid body that cannot turn about an axis fixed in space, on SO(3).
 
-    ℓ = ½ ω·Jω - w·γ,  φ = γ·ω,  γ = Rᵀ e₃,
+    ℓ = ½ ω·Jω - w·γ,  φ = γ·ω,  γ = Rᵀ e₃.
 
-    with the attitude quaternion q of the rotation R, the body angular velocity ω, and
-    the vertical γ seen from the body. Without weight, the horizontal part of the
-    angular momentum in space is conserved in addition to the energy, and the problem is
-    integrable.
+    Here q is the attitude quaternion of the rotation R, ω is the body angular velocity,
+    and γ is the upward vertical in body axes. Without weight, the horizontal part of
+    the angular momentum in space is conserved in addition to the energy, and the
+    problem is integrable.
 
     **Parameters:** `inertia` J, the matrix of inertia about the fixed point [kg m²];
-    `weight` w = m g X [N m], with X the centre of mass in the body; `retraction`, the
-    retraction of SO(3).
+    `weight` w = m g X [N m], with the vector X from the fixed point to the centre of
+    mass in body axes; `retraction`, the retraction of SO(3).
 
     **Source:** Veselov and Veselova, "Integrable nonholonomic systems on Lie groups",
     Math. Notes 44 (1988).
@@ -67,7 +67,7 @@ class Veselova(AbstractConstrainedGroupExample):
         return SO3(self.retraction)
 
     def vertical(self, q: Array) -> Array:
-        """Compute γ = Rᵀ e₃, the vertical seen from the body."""
+        """Compute γ = Rᵀ e₃, the upward vertical in body axes."""
         return self.manifold.Ad_dual(q, jnp.array([0.0, 0.0, 1.0], q.dtype))
 
     def lagrangian(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:

@@ -210,7 +210,7 @@ class WhippleBicycle(AbstractNonholonomicExample):
         return force.at[5].set(self.steering(t, q, v, args))
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
-        """Compute the energy, which is conserved without a torque on the steer axis."""
+        """Compute the energy, which is conserved if `steering` is None."""
         return {"energy": self.energy(t, q, v)} if self.steering is None else {}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Float[Array, "3"]]:

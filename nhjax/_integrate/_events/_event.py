@@ -41,9 +41,10 @@ class Event(eqx.Module):
     `integrate(..., event=...)` finds the zeros of `cond_fn(t, y, args)` from its signs
     at the ends of the steps. If the sign changes in a step, the step is repeated with a
     size θ dt, 0 < θ <= 1, such that the function is zero, up to round-off, at the end
-    of the step. So the state at the event is the end of a step of the method. This size
-    is differentiated by the implicit function theorem. If there is a `reset`, it resets
-    the state at the event. Then the run ends, or continues with the rest of the step.
+    of the step. So the state at the event is the end of a step of the method. The size
+    θ dt is differentiated by the implicit function theorem. If there is a `reset`, it
+    resets the state at the event. Then the run ends, or continues with the rest of the
+    step.
 
     If the function is zero at `t0` or right after an event, the sign of its rate along
     the motion is used instead. So a trajectory that starts at a zero and leaves it does

@@ -19,7 +19,7 @@ class LogEntry(eqx.Module):
     - `node`, `offset`: the iteration started at t_k + offset, where k = `node`.
     - `size`: the size of the step that ended at the event; 0 if there was no step,
         because an earlier reset had carried the condition across zero.
-    - `scale`: the size of the condition in that step, by `ConditionSigns.scale`.
+    - `scale`: the result of `ConditionSigns.scale` for the event in that step.
     - `node_after`, `offset_after`: where the next iteration starts.
     """
 

@@ -27,7 +27,7 @@ class TruncatedStep(NamedTuple):
     """A step to a node or to an event.
 
     - `outcome`: the outcome of the step.
-    - `h`: its size.
+    - `h`: the size of the step.
     - `fired`: the index of the event at its end, -1 if the step is not truncated.
     - `values`: the values of the conditions at its end.
     - `crossed`: the conditions that crossed zero in the step.
@@ -60,8 +60,8 @@ class ImplicitTruncatedStep(AbstractImplicitFunction[Given, TruncatedStep]):
 
     d(θ h) = - (∂g/∂h)⁻¹ dg,
 
-    where dg is the change of g at fixed step size. If g does not change with the size,
-    the derivative is NaN.
+    where dg is the change of g at fixed step size. If g does not change with the step
+    size, the derivative of θ h is NaN.
 
     - `step`: the step of any size.
     - `signs`: the signs of the conditions at the start of the step.
@@ -69,7 +69,7 @@ class ImplicitTruncatedStep(AbstractImplicitFunction[Given, TruncatedStep]):
     - `values_at_end`: if the step is truncated, the values of the conditions at the end
         of the whole step.
     - `known_event`: the event at which a step of the given size is known to end, -1 for
-        none; None if the event must be searched for.
+        no event; None if the event must be searched for.
     """
 
     step: ImplicitStep

@@ -106,12 +106,13 @@ class ReplayedIteration(eqx.Module):
 
     - `node`, `offset`, `num_events`: the start of the iteration, as in
       `EventLoopState`.
-    - `row`: the number of output rows that were filled before.
+    - `row`: the number of output rows that were filled before. For a discarded
+        iteration it is the number of steps, the index of an unused row.
     - `which`: the index of the event at the end of the iteration, or -1.
     - `size`: the size of the step.
-    - `scale`: the size of the condition of that event in the step.
+    - `scale`: as in `LogEntry`, for that event.
     - `is_active`: whether the iteration took a step or handled an event without a step.
-        Otherwise the iteration was idle.
+        Otherwise the iteration was idle or discarded.
     - `was_truncated`: whether the previous iteration was discarded, because its step
         contains an event.
     """
