@@ -1111,7 +1111,7 @@ def load_on(
 def absolute_load(
     load: Any, t: Any, q: Any, v: Array, multipliers: Array, args: Any
 ) -> FloatScalar:
-    """Compute |N| of a load that is a number or a function of the user [N]."""
+    """Compute the load |N| [N] from a number or from a function that the user gives."""
     if callable(load):
         with naming("load(t, q, v, multipliers, args)", as_given(load), args):
             load = load(t, q, v, multipliers, args)

@@ -356,7 +356,10 @@ def tracked_jit(*tracked: str) -> Callable[[Callable[..., T]], Callable[..., T]]
 
 
 def _remember_changes(key: _Key, before: Captured) -> None:
-    """Ignore the places that tracing changed, and store the program under a new key."""
+    """Record the places that tracing changed, and a key that leaves them out.
+
+    Later calls ignore these places, and find the program by this key.
+    """
     functions = before.functions
     after = Captured(functions, _changed_by_tracing)
     changed = {}

@@ -266,7 +266,7 @@ class SE2(AbstractMotionGroup):
         return FramedPose(rate, -eta[2] * g.sin, eta[2] * g.cos)
 
     def dtau(self, xi: Twist, eta: Twist) -> Twist:
-        """Compute dτ_ξ η by the formula of `SO3`, restricted to planar motions."""
+        """Compute dτ_ξ η = α η - β [ξ, η] + γ ωσ ξ for ξ = (v, ω), η = (u, σ)."""
         v, omega = xi[:2], xi[2]
         u, sigma = eta[:2], eta[2]
         s = omega**2
@@ -276,7 +276,7 @@ class SE2(AbstractMotionGroup):
         return jnp.concatenate([linear, (alpha + gamma * s) * eta[2:]])
 
     def dtau_inv(self, xi: Twist, eta: Twist) -> Twist:
-        """Compute dτ_ξ⁻¹ η by the formula of `SO3`, restricted to planar motions."""
+        """Compute dτ_ξ⁻¹ η = α η + ½ [ξ, η] + γ ωσ ξ for ξ = (v, ω), η = (u, σ)."""
         v, omega = xi[:2], xi[2]
         u, sigma = eta[:2], eta[2]
         s = omega**2

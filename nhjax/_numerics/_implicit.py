@@ -339,7 +339,9 @@ def has_tangent(tangents: PyTree[Any]) -> PyTree[bool]:
 
 
 def with_zero_tangents(tree: X, parameters: PyTree[Any]) -> X:
-    """Return the same tree, with tangents of zeros if any parameter has a tangent.
+    """Return the same tree, in which each array has a tangent, which may be zero.
+
+    If no parameter has a tangent, the tree does not change.
 
     JAX traces the body of a loop again if a part of the carry has no tangent at first,
     but has a tangent after an iteration. If the initial carry has tangents of zeros,

@@ -91,8 +91,9 @@ def simplified_newton_update(
     x_next = factors.correct_nodes(stages, x_next, r_nodes, change)
     if stages.invariants is not None:
         # The impulses are corrected before the constraints, so that the constraints are
-        # evaluated after the impulses have changed the unknowns. If a system is nearly
-        # at rest, the work of the reactions on this change is not negligible.
+        # evaluated after the impulses have changed the unknowns. This order matters if
+        # a system is nearly at rest: the work that the reactions do on the change by
+        # the impulses is then not negligible.
         error = invariant_errors(stages, x_next)
         x_next = factors.correct_impulses(stages, x_next, error)
     if factors.full is not None:

@@ -114,10 +114,11 @@ def local_error(
     mean = jnp.asarray(method.b, h.dtype) @ outcome.record.velocity
     by_chart = _growth_in_chart(system.manifold_of(start.state.q), h * mean)
     # The derivative of order k + 1 of q is the derivative of order k of the velocity.
-    in_position = in_position / jnp.abs(h)
+    # Products with the inverses take less time than divisions.
+    per_fibre, per_position = (1 / in_fibre)[None], (jnp.abs(h) / in_position)[None]
     sizes = (
-        _largest(changes / in_fibre[None], moved / in_fibre[None]),
-        _largest(displacements / in_position[None], in_velocity / in_position[None]),
+        _largest(changes * per_fibre, moved * per_fibre),
+        _largest(displacements * per_position, in_velocity * per_position),
     )
     orders = method.order + 1, method.order
     (fibre, in_u), (position, in_q) = (
@@ -133,7 +134,7 @@ def local_error(
 def _largest(by_force: Array, by_velocity: Array) -> Float[Array, " s"]:
     """Return the larger of two estimates of the size of each derivative (a row)."""
     both = jnp.stack([by_force, by_velocity])
-    return jnp.max(jnp.sqrt(jnp.mean(both**2, axis=2)), axis=0)
+    return jnp.sqrt(jnp.max(jnp.mean(both**2, axis=2), axis=0))
 
 
 def _velocity_rate(
@@ -193,8 +194,10 @@ def _extrapolated(
 
 
 def _root(x: FloatScalar, n: int) -> FloatScalar:
-    # This takes less time than `x ** (1 / n)`, and its error does not matter here.
-    return jnp.sqrt(x) if n == 2 else jnp.exp(jnp.log(x) / n) if n > 2 else x
+    # All of these take less time than `x ** (1 / n)`. Their errors do not matter here.
+    if n > 3:
+        return jnp.exp(jnp.log(x) / n)
+    return (x, jnp.sqrt(x), jnp.cbrt(x))[n - 1]
 
 
 @functools.cache

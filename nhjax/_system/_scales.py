@@ -139,7 +139,8 @@ def keeps_constraints(
 
 
 def _finite_or_zero(x: Array) -> Array:
-    # If a constraint is singular at zero, its value there does not measure its size.
+    # A constraint that is singular at zero has no finite value there. This value does
+    # not show how large the terms of the constraint are, so it is replaced by 0.
     return jnp.abs(jnp.nan_to_num(x, nan=0.0, posinf=0.0, neginf=0.0))
 
 

@@ -174,9 +174,10 @@ class ConditionSigns(eqx.Module):
     def after_step(
         self, at_node: BoolScalar, values: Float[Array, " e"]
     ) -> "ConditionSigns":
-        """Return the signs after a whole step, if it leads to a node.
+        """Return the signs at the node that a step reaches, or else the old signs.
 
-        `values` are the conditions there.
+        `at_node` is whether the step reaches a node, and `values` are the conditions
+        at this node.
         """
         sign = jnp.where(values == 0, self.sign, jnp.sign(values))
         return ConditionSigns(
