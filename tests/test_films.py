@@ -424,6 +424,13 @@ assert np.sum((red > 150) & (blue < 90)) > 5, "no mark"
 is_grey = (np.ptp(pixels, axis=2) < 16) & (red > 120) & (red < 240)
 assert np.sum(is_grey) > 100, "no ground"
 assert np.sum((blue > red + 8)[:8]) > 20, "no sky"
+# The run ends at 2 s, which is not the time of a frame.
+for end, options in (("default", {}), ("end", {"t": 2.0})):
+    nhjax.render(
+        disc, sol, f"{folder}/{end}.png", size=(64, 48), fps=5, speed=7.0, **options
+    )
+ends = [np.asarray(Image.open(f"{folder}/{x}.png")) for x in ("default", "end")]
+assert np.array_equal(*ends), "the default is not the end of the run"
 nhjax.render(disc, sol, f"{folder}/a.gif", size=(64, 48), fps=5, speed=2.0)
 frames = list(ImageSequence.Iterator(Image.open(f"{folder}/a.gif")))
 assert len(frames) == 6, len(frames)

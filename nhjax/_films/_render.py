@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 from .._errors import check_choice
 from .._integrate import Solution
 from .._robots import mujoco_of
-from ._sampling import check_solution, frame_times
+from ._sampling import check_solution, ends_of_output, frame_times
 from ._scene import Scene
 
 
@@ -56,15 +56,15 @@ def render(
     - `fps`: the number of frames in a second of the film.
     - `speed`: the number of seconds of the motion in a second of the film.
     - `size`: the width and the height in pixels; both must be even for `.mp4`.
-    - `t`: the time of the picture, only for `.png`. The default is the time of the last
-        frame of the film.
+    - `t`: the time of the picture, only for `.png`. The default is the end of the run.
     - `trail`: whether to draw the paths of contact points, or the `trails` of a
         `Looks`.
 
     **Returns:** the path of the file.
 
     **Raises:** `ImportError` without MuJoCo's renderer or the encoder
-    (`pip install "nhjax[render]"`); `RuntimeError` if no OpenGL context can be created;
+    (`pip install "nhjax[render]"`); `RuntimeError` if no OpenGL context can be created,
+    or if the encoder fails; `FileNotFoundError` if the folder of `path` does not exist;
     `TypeError` and `ValueError` for a machine without a shape, a batch, a run without
     states or with too few of them, and unknown suffixes and cameras.
 
@@ -83,8 +83,8 @@ def render(
     if target.suffix == ".png":
         # The frames before the time of the picture are needed for the centre of the
         # camera and the trail.
-        end = times[-1] if t is None else t
-        times = _until(times, end)
+        first, last = ends_of_output("render", sol)
+        times = _until(times, (first, last), last if t is None else t)
     scene = Scene("render", machine, sol, times, trail)
     view = view_of(scene, camera, shown)
     if target.suffix == ".png":
@@ -275,11 +275,12 @@ def _checked(
     return target, (width, height)
 
 
-def _until(times: np.ndarray, end: float) -> np.ndarray:
-    low, high = sorted((times[0], times[-1]))
+def _until(times: np.ndarray, ends: tuple[float, float], end: float) -> np.ndarray:
+    """Return the times of frames before a time between `ends`, and this time."""
+    low, high = sorted(ends)
     if not low <= end <= high:
         raise ValueError(f"render: `t` must be between {low} and {high}, got {end}.")
-    forward = 1 if times[-1] >= times[0] else -1
+    forward = 1 if ends[1] >= ends[0] else -1
     before = times[forward * times < forward * end]
     return np.append(before, end)
 

@@ -31,13 +31,17 @@ def check_solution(who: str, sol: Any) -> None:
         )
 
 
+def ends_of_output(who: str, sol: Solution) -> tuple[float, float]:
+    """Return the first and the last time at which the configuration is known."""
+    if sol.interpolation is not None:
+        return float(sol.t0), float(sol.t1)
+    saved, _ = _rows(who, sol)
+    return float(saved[0]), float(saved[-1])
+
+
 def frame_times(who: str, sol: Solution, spacing: float) -> np.ndarray:
     """Return the times of the frames, equally spaced from the start of the output."""
-    if sol.interpolation is None:
-        saved, _ = _rows(who, sol)
-        first, last = float(saved[0]), float(saved[-1])
-    else:
-        first, last = float(sol.t0), float(sol.t1)
+    first, last = ends_of_output(who, sol)
     duration = abs(last - first)
     # Without the factor, round-off could remove the last frame.
     steps = np.arange(int(duration / spacing * (1 + 1e-9)) + 1)
