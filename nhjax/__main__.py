@@ -114,7 +114,7 @@ def _add_options(parser: argparse.ArgumentParser, function: Callable) -> None:
         keywords = dict(_OPTIONS[name])
         keywords["help"] += told
         group = length if length and name == "final_time" else parser
-        # The study itself supplies the defaults.
+        # Without the option, the study itself supplies the default.
         group.add_argument(
             f"--{name.replace('_', '-')}", default=argparse.SUPPRESS, **keywords
         )

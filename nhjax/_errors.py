@@ -131,7 +131,7 @@ def _about_args(error: Exception, args: Any) -> str:
 
 
 def _place(function: Any) -> str:
-    """Write where a function is defined, if that is known."""
+    """Return a function's name, file and line as text; "" if they are unknown."""
     function = inspect.unwrap(getattr(function, "__func__", function))
     while isinstance(function, functools.partial):
         function = function.func
@@ -206,7 +206,7 @@ def undecided(*checks: Check) -> list[Check]:
 
 
 def on_host(values: T) -> T:
-    """Return a tree with NumPy arrays, so that comparing them compiles no program.
+    """Convert arrays to NumPy arrays, so that comparing them compiles no program.
 
     A tree with traced arrays is returned unchanged.
     """
@@ -271,7 +271,8 @@ def _raise_where(
     described: PyTree[Any],
 ) -> T:
     """Return `tree`, or raise `error`; `described` has places instead of arrays."""
-    # The call-back outlives the trace, and must not refer to traced arrays.
+    # The call-back outlives the trace: it may use shapes and dtypes of traced arrays,
+    # but not the arrays.
     kinds = [(x.shape, x.dtype) for x in arrays]
     packed, slices = _packed(arrays)
 

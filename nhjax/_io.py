@@ -201,10 +201,10 @@ def installed_version() -> str:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Read all entries; the checksums of the .npz file detect damaged entries."""
+    """Read the header and the arrays; checksums of the .npz detect damaged entries."""
     # Open the file here: NumPy does not close a damaged file that it has opened itself.
     with open(path, "rb") as opened:
-        # For files of other formats, NumPy would recommend loading pickled objects.
+        # For other formats, NumPy's own error would recommend loading pickled objects.
         if not zipfile.is_zipfile(opened):
             raise ValueError("it is not an .npz")
         opened.seek(0)
@@ -234,7 +234,7 @@ def _describe(tree: Any, arrays: dict[str, np.ndarray], path: str = "") -> Any:
     if tree is None or type(tree) in (bool, int, str):
         return {"kind": "value", "value": tree}
     if type(tree) is float:
-        # JSON has no infinity and no NaN.
+        # JSON has no infinity and no NaN: `_rebuild` reads `text`.
         value = tree if math.isfinite(tree) else None
         return {"kind": "float", "value": value, "text": repr(tree)}
     if isinstance(tree, type(RESULTS.successful)) and tree._enumeration is RESULTS:

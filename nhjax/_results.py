@@ -42,7 +42,10 @@ class _Named(type(eqx.Enumeration)):
 
 
 def _counted(codes: np.ndarray, names: dict[int, str]) -> str:
-    """Count many runs by result, with the first run of each result except success."""
+    """Return a text that counts runs by result.
+
+    It also names the first run of each result except `successful`.
+    """
     parts = []
     for code in np.unique(codes):
         where, name = np.argwhere(codes == code), names[int(code)]

@@ -37,12 +37,12 @@ from ._system import (
 
 
 def positive(value: Any) -> Array:
-    """Convert a parameter that is one positive number."""
+    """Convert a parameter to an array, or raise unless it is one positive number."""
     return _checked_sign(value, "positive", lambda x: x > 0)
 
 
 def not_negative(value: Any) -> Array:
-    """Convert a parameter that is one number, positive or zero."""
+    """Convert a parameter to an array, or raise unless it is one number >= 0."""
     return _checked_sign(value, "positive or zero", lambda x: x >= 0)
 
 
@@ -54,7 +54,7 @@ def _checked_sign(value: Any, sign: str, is_right: Callable[[Any], Any]) -> Arra
 
 
 def _number(value: Any) -> Array:
-    """Convert a parameter to floating point."""
+    """Convert a parameter to an array of floats, or raise if it is not real."""
     if value is None or callable(value):
         raise TypeError(
             f"A parameter of a force must be a number or an array, got "
@@ -70,7 +70,7 @@ def _number(value: Any) -> Array:
 
 
 def scalar(value: Any) -> Array:
-    """Convert a parameter that is one number."""
+    """Convert a parameter to an array, or raise unless it is one real number."""
     number = _number(value)
     if number.shape != ():
         raise ShapeError(
@@ -99,9 +99,10 @@ def position_function(value: Any) -> Any:
 
 
 def of_phase(name: str, value: Any, like: Array, *arguments: Any) -> Array:
-    """Return a number, an array or the value of a function, in the shape of `like`.
+    """Return a parameter, or its value if it is a function, in the dtype of `like`.
 
-    The user's function takes (t, q, v, args) or (t, q, v, multipliers, args).
+    Another shape than that of `like` raises a `ShapeError`. The user's function takes
+    (t, q, v, args) or (t, q, v, multipliers, args).
     """
     if callable(value):
         names = ["t", "q", "v", "args"]
@@ -121,10 +122,10 @@ def of_phase(name: str, value: Any, like: Array, *arguments: Any) -> Array:
 
 
 class AbstractSummable(AbstractOfSystem):
-    """A generalised force that can be added to others and to functions of the user."""
+    """A generalised force that can be added to others and to the user's functions."""
 
     def check_system(self, system: Any) -> None:
-        """Accept every system, as functions of the user do."""
+        """Accept every system; forces with requirements override this method."""
 
     def __add__(self, other: Any) -> "Sum":
         """Add another force, or a function F(t, q, v, args)."""
@@ -136,7 +137,7 @@ class AbstractSummable(AbstractOfSystem):
             return self
         return Sum(cast(Any, other), cast(Any, self))
 
-    # Without this, a NumPy array on the left of `+` would add its elements one by one.
+    # Without this, a NumPy array to the left of `+` would add the force elementwise.
     __array_ufunc__ = None
 
 
@@ -226,7 +227,7 @@ class Sum(AbstractSummable):
         return any(takes_multipliers(as_given(term)) for term in self.terms)
 
     def check_system(self, system: Any) -> None:
-        """Check each term."""
+        """Raise a `ValueError` unless each term fits the system."""
         for term in self.terms:
             if isinstance(term, AbstractOfSystem):
                 term.check_system(system)
@@ -369,7 +370,7 @@ class Torque(_AbstractPulledBack):
     def _covector(self, t: Any, q: Any, v: Array, args: Any) -> Array:
         rotation = self._place(t, q, args)
         torque = of_phase("vector", self.vector, rotation[0], t, q, v, args)
-        # With Ṙ = hat(ω) R, the inner product of ½ hat(τ) R and Ṙ is τ · ω.
+        # The covector is ½ hat(τ) R: its inner product with Ṙ = hat(ω) R is τ · ω.
         return 0.5 * jnp.cross(torque[:, None], rotation, axis=0)
 
 
@@ -615,13 +616,13 @@ def saturated(x: ArrayLike, limit: ArrayLike) -> Array:
 
 
 def value_at(name: str, function: Any, t: Any, q: Any, args: Any) -> Array:
-    """Evaluate a function of (t, q, args) of the user."""
+    """Evaluate a user's function of (t, q, args), as an array."""
     with naming(f"{name}(t, q, args)", as_given(function), args):
         return jnp.asarray(function(t, q, args))
 
 
 def in_precision_of(x: Array, *numbers: ArrayLike) -> list[Array]:
-    """Convert numbers to the precision of x."""
+    """Convert numbers to arrays of the dtype of x."""
     return [jnp.asarray(number, x.dtype) for number in numbers]
 
 

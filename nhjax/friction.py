@@ -181,7 +181,7 @@ class MagicFormula(AbstractFrictionLaw):
         b, c, d, e = in_precision_of(
             square, self.stiffness, self.shape, self.peak, self.curvature
         )
-        # Each function is odd, and is evaluated as x f(x²).
+        # The functions sin and atan are odd, and are evaluated as x f(x²).
         first = b * (1 - e * (1 - _atan_slope(b * b * square)))
         second = c * first * _atan_slope(first * first * square)
         return d * second * _sin_slope(second * second * square)
@@ -202,8 +202,8 @@ def _require_velocities(force: Any, system: Any) -> None:
 class _AbstractOnContact(AbstractForceOfReactions):
     """A force -|N| f(r) r at a contact with the normal force N.
 
-    r is a velocity, or an angular velocity, of the contact that is linear in v, and
-    f > 0. The generalised force is (∂r/∂v)ᵀ times this force, so that its power is
+    r, a velocity or an angular velocity of the contact, is linear in v, and f > 0. The
+    generalised force is (∂r/∂v)ᵀ times this force, so that its power is
     -|N| f(r) r².
     """
 

@@ -68,7 +68,7 @@ Length: TypeAlias = ArrayLike | Callable[[Args], ArrayLike]
 
 
 def _length(name: str) -> Callable[[Any], Any]:
-    """Return a converter of numbers, and of functions of `args` that return them."""
+    """Return a converter for a length: numbers, or a function of `args`."""
 
     def converted(value):
         if callable(value):
@@ -545,7 +545,7 @@ class Wheel(AbstractContact):
     - `ground`: a `Plane` or a `Surface`; by default the plane z = 0.
     - `manifold`: the manifold of the system, if it has one.
 
-    **Raises:** `ValueError` if `no_slip` has another name, or linearly dependent
+    **Raises:** `ValueError` if `no_slip` has an unknown name, or linearly dependent
     directions; when called, `ShapeError` if the pose has other shapes.
 
     !!! example
@@ -829,7 +829,7 @@ class Contacts(eqx.Module):
         multipliers: Float[Array, " l"],
         args: Args = None,
     ) -> dict[str, Float[Array, "3"]]:
-        """Compute the result of `forces` from multipliers, for a force of your own."""
+        """Compute the forces in space from multipliers, for a force law of your own."""
         parts = self._in_frames(multipliers)
         return {
             name: parts[name] @ contact.frame(t, q, args)
@@ -879,8 +879,8 @@ class Contacts(eqx.Module):
         """Raise a `ValueError` unless a system has these constraints and no others.
 
         With these constraints, the multipliers are in the order of the contacts. With
-        `followed_by`, the holonomic constraints are a function of the user, and are not
-        checked.
+        `followed_by`, the user combines the holonomic constraints in one function,
+        which is not checked.
         """
         names = ("nonholonomic", "holonomic")
         for name in names[:1] if self._num_others else names:

@@ -32,7 +32,8 @@ from .._system import (
 from ._motion import convert_to_velocities
 
 
-# A derivative counts as zero if it vanishes at this many states near the given state.
+# A derivative counts as zero if it vanishes at `_NUM_SAMPLES` states, at random
+# distances of the order of `_SPREAD` from the given state.
 _NUM_SAMPLES = 3
 _SPREAD = 0.3
 
@@ -206,9 +207,9 @@ def check_system(
 
 
 def _changes(derivatives: np.ndarray) -> np.ndarray:
-    """Return which values change, from derivatives at several states (first axis).
+    """Return which derivatives are nonzero at any of several states (first axis).
 
-    A derivative that is not finite counts as a change.
+    A NaN counts as a nonzero derivative.
     """
     return np.asarray(np.any(~(derivatives == 0), axis=0))
 
@@ -243,7 +244,7 @@ def _measurements(system, t, q, u, args) -> dict[str, Any]:
 
 
 def _derivatives(system, t, q, u, args, near) -> dict[str, Any]:
-    """Compute derivatives of the functions at a state and at states near it."""
+    """Compute values and matrices at a state, and derivatives at states near it."""
     manifold = system.manifold_of(q)
 
     def hessian(t, xi, u):
@@ -289,8 +290,9 @@ def _derivatives(system, t, q, u, args, near) -> dict[str, Any]:
 
     by_time, by_position, second = jax.vmap(sample)(*near)
     rows = constraint_rows(t, jnp.zeros_like(u), u)
-    # If a constraint is the square of an expression, its row is zero at states that
-    # satisfy the constraint. The row at nearby states sets the bound for a zero row.
+    # If a constraint is the square of an expression, its row is zero up to round-off at
+    # states that satisfy the constraint. A row counts as zero if it is tiny compared to
+    # the row at nearby states.
     rows_near = jax.vmap(constraint_rows, (None, 0, 0))(t, *near)
     elsewhere = jnp.max(jnp.abs(rows_near), axis=(0, 2))
     zero = jnp.finfo(u.dtype).eps ** 0.75 * elsewhere

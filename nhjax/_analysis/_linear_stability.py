@@ -44,8 +44,8 @@ class LinearStability(eqx.Module):
         shape (2n, d). The first n rows are the change ξ of the configuration, which
         becomes q + ξ, or q τ(ξ) on a group. The last n rows are the change w of the
         velocity, or of the momentum of a Hamiltonian system. With a `symmetry`,
-        perturbations that differ along the generators are equivalent, and each column
-        represents a class of equivalent perturbations.
+        perturbations that differ by a combination of the generators are equivalent, and
+        each column represents a class of equivalent perturbations.
     """
 
     matrix: Float[Array, "d d"]
@@ -192,10 +192,11 @@ def _drift_rates(
 ) -> BoundedResidual:
     """Compute the rates that vanish in a steady motion, and their bounds.
 
-    In a steady motion, the chosen coordinates are constant; if none are chosen, all
-    velocities are constant. Their first and second time derivatives must vanish. The
-    first alone is not enough: for the velocity of a pendulum, it also vanishes at the
-    lowest point. The bounds allow for states that are accurate to only a few digits.
+    In a steady motion, the chosen positions and velocities are constant; if none are
+    chosen, all velocities are constant. Their first and second time derivatives must
+    vanish. The first alone is not enough: for the velocity of a pendulum, it also
+    vanishes at the lowest point. The bounds allow for states that are accurate to only
+    a few digits.
     """
     dim = linearised.position_jacobian.shape[1]
     if independent is None:
@@ -296,7 +297,7 @@ def check_independent(
     positions: Sequence[int] | None,
     velocities: Sequence[int] | None,
 ) -> tuple[Indices, Indices] | None:
-    """Return the chosen independent coordinates, checked, or None."""
+    """Check and return the indices of independent coordinates; None if not given."""
     if positions is None and velocities is None:
         return None
     if positions is None or velocities is None:

@@ -89,7 +89,7 @@ class LinearisedEquations(NamedTuple):
 
 
 def state_size(y: State) -> Array:
-    """Return the largest absolute value in a state, the scale of its errors."""
+    """Return the scale of a state's errors: its largest absolute value, or 1 if 0."""
     return nonzero_or_one(max_norm(*jax.tree.leaves(y.q), y.v, y.p))
 
 
@@ -301,7 +301,7 @@ def independent_basis(
         unit[jnp.asarray(positions, int)],
         unit[jnp.asarray(velocities, int)],
     )
-    # The least-norm change of positions: unconstrained positions do not change.
+    # Least-norm changes: positions neither chosen nor constrained do not change.
     wanted = jnp.concatenate(
         [
             jnp.eye(count, dtype=dtype),
@@ -340,9 +340,10 @@ class SymmetryConditions(NamedTuple):
         are not defined.
     - `independent`: whether the generators are independent.
     - `on_constraints`: the rates at which generators violate the constraints.
-    - `drift`: the motion minus the combination of generators, one entry for each
-      component.
-    - `bracket`: the brackets of the motion with each generator, and their derivatives.
+    - `drift`: the rates of the state minus the closest combination of generators, one
+      entry for each component.
+    - `bracket`: the Lie brackets of the equations of motion with each generator, and
+      their derivatives.
     - `closed`: the rates at which generators leave their span in the moving frame.
 
     Except for `drift`, the arrays have one row for each generator.
@@ -412,7 +413,7 @@ def check_relative_equilibrium(
 def _bracket_derivatives(
     orbit: Orbit,
 ) -> tuple[Float[Array, "k x x"], Float[Array, "k x x"]]:
-    """Differentiate the brackets of the motion with each generator.
+    """Differentiate the Lie brackets of the equations of motion with each generator.
 
     Second derivatives are central differences, which are accurate enough for a check.
     Another automatic derivative would make the compile time three times as long.
@@ -458,7 +459,7 @@ def check_symmetry(symmetry: Any, y: State) -> None:
 
 
 def indices(name: str, values: Sequence[int], dim: int) -> Indices:
-    """Return the indices of coordinates as a tuple, or raise a `ValueError`."""
+    """Return the indices of coordinates as a tuple; raise if they are not valid."""
     try:
         found = tuple(operator.index(value) for value in values)
     except TypeError:

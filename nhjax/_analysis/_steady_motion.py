@@ -430,7 +430,7 @@ def least_norm_root(
 
 
 def checked_count(name: str, value: Any) -> int:
-    """Return a number of iterations, or raise a `ValueError`."""
+    """Return `value` as an int >= 1, or raise a `ValueError`."""
     try:
         count = operator.index(value)
     except TypeError:

@@ -20,16 +20,16 @@ class TraceCache:
     """A cache of the traced programs of functions.
 
     A key contains the function, the types of its array arguments, and its other
-    arguments, but not the globals and closed-over variables that it reads. These may
-    change between two calls of `integrate`. A cache is therefore used only while one
-    run is traced and differentiated.
+    arguments, but not the globals and closed-over variables that the function reads.
+    These may change between two calls of `integrate`. A cache is therefore used only
+    while one run is traced and differentiated.
     """
 
     def __init__(self):
         self._known: dict[Hashable, _Traced] = {}
 
     def find(self, key: Hashable) -> "_Traced | None":
-        """Return the program of this key, or `None`."""
+        """Return the program stored under `key`, or `None` if there is none."""
         return self._known.get(key)
 
     def keep(self, key: Hashable, traced: "_Traced") -> None:
@@ -39,7 +39,7 @@ class TraceCache:
 
 
 class _Traced(NamedTuple):
-    """A traced function: its jaxpr, the tree of its arrays, and its other results."""
+    """A jaxpr, the tree structure of its array results, and the other results."""
 
     program: Any
     structure: Any
@@ -64,7 +64,8 @@ def as_cpu_kernel(
         objects.
     - `programs`: a cache of traced programs. With a cache, the function is traced once
         for each structure, shape and dtype of the arrays in `args`, and for each value
-        of the other objects in `args`. It must not depend on values outside `args`.
+        of the other objects in `args`. The function must then not depend on values
+        outside `args`.
     - `is_brief`: whether the program runs once and for a short time. Such a program is
         compiled in less time, to slower code.
     """

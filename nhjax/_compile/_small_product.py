@@ -40,8 +40,8 @@ def _written_out(
     x, y = _aligned(a, first, order), _aligned(b, second, order)
     if not by_terms:
         return jnp.sum(x * y, axis=tuple(range(len(result), len(order))))
-    # The terms are added one by one, because a reduction of this size would be a call
-    # into a library.
+    # The terms are added one by one, because XLA would leave so large a reduction to a
+    # library.
     ranges = (range(a.shape[first.index(index)]) for index in summed)
     return reduce(
         jnp.add, (x[..., *k] * y[..., *k] for k in itertools.product(*ranges))
@@ -49,9 +49,7 @@ def _written_out(
 
 
 def _aligned(x: Array, indices: str, order: list[str]) -> Array:
-    """Transpose x to the given order of indices; missing indices get an axis of length
-    1.
-    """
+    """Transpose x to an order of indices; missing indices get an axis of length 1."""
     present = [index for index in order if index in indices]
     x = jnp.transpose(x, [indices.index(index) for index in present])
     return jnp.expand_dims(

@@ -2,7 +2,7 @@
 
 A function compiled by `jax.jit` always uses the values that globals and closed-over
 variables had when it was traced. `tracked_jit` traces the function again when a value
-changes: at each call `captured_by` lists the values that the functions of the user
+changes: at each call `captured_by` lists the values that the user's functions
 read, and the list is a part of the key of the compiled program.
 """
 
@@ -33,7 +33,7 @@ from ..lanes import rare_collections
 # The owner of a value is the object that contains the value. The place of the value
 # consists of the identity of its owner and a name or index in the owner.
 Place: TypeAlias = tuple[int, Hashable]
-# The owner of a value, its name in the owner, and the value.
+# The owner of a value, the name of the value in the owner, and the value.
 Part: TypeAlias = tuple[object, Hashable, Any]
 T = TypeVar("T")
 
@@ -59,7 +59,7 @@ _CONTAINERS += (types.SimpleNamespace, argparse.Namespace, eqx.Module)
 
 @lru_cache(maxsize=4096)
 def _names(code: types.CodeType) -> tuple[dict[str, None], dict[str, None]]:
-    """Find the globals and attributes that code and the functions inside it read."""
+    """Return the names of globals and attributes that code and inner functions read."""
     variables, attributes = {}, {}
     for instruction in dis.get_instructions(code):
         if instruction.opname in ("LOAD_ATTR", "LOAD_METHOD"):
@@ -138,7 +138,7 @@ def _atom(value: Any) -> Hashable:
 def _key_name(key: Any) -> Hashable:
     """Return the data by which a key of a mapping is compared.
 
-    Keys that are equal may still differ: 0.0 and -0.0, or objects of the user.
+    Keys that are equal may still differ: 0.0 and -0.0, or the user's objects.
     """
     return (type(key), key) if isinstance(key, _PLAIN) else _Identity(id(key), key)
 
@@ -208,7 +208,7 @@ def _of_class(cls: type) -> Iterator[Part]:
             elif isinstance(value, (staticmethod, classmethod)):
                 value = value.__func__
             if isinstance(value, types.FunctionType):
-                # Methods that a dataclass generates read no values of the user.
+                # Methods that a dataclass generates read none of the user's values.
                 if value.__code__.co_filename != "<string>":
                     yield base, name, value
             elif not (name.startswith("__") or name == "_abc_impl"):
@@ -217,7 +217,7 @@ def _of_class(cls: type) -> Iterator[Part]:
 
 @lru_cache(maxsize=4096)
 def _static_fields(cls: type) -> tuple[str, ...] | None:
-    """Return the names of static fields; `None` if a class of a library has none."""
+    """Return names of a class's static fields; `None` if a library class has none."""
     fields = getattr(cls, "__dataclass_fields__", {}).values()
     names = tuple(x.name for x in fields if x.metadata.get("static", False))
     return names or (None if _is_installed(cls.__module__) else ())
@@ -252,10 +252,11 @@ class Captured:
     - `contents`: the owner and the content of each place; the content of an object with
       parts is its identity. The owners are stored, so that no other object gets the
       same identity.
+    - `is_repeatable`: False if a value is a tracer, or if `atoms` is incomplete.
     """
 
     def __init__(self, functions: Any, ignored: Collection[Place] = ()):
-        # The search after tracing must start from the same object.
+        # Stored, because the search after tracing must start from the same object.
         self.functions = functions
         self.atoms: list[Hashable] = []
         self.contents: dict[Place, tuple[object, Hashable]] = {}
@@ -269,7 +270,7 @@ class Captured:
                 continue
             content = atom = _atom(value)
             if isinstance(atom, _Unrepeatable):
-                # A function that stores a tracer stores a new tracer at each tracing.
+                # Tracing may replace a stored tracer by another: compare identities.
                 content = _Identity(id(value), value)
                 self.is_repeatable = False
             has_objects = isinstance(value, np.ndarray) and value.dtype.hasobject
@@ -325,7 +326,7 @@ def tracked_jit(*tracked: str) -> Callable[[Callable[..., T]], Callable[..., T]]
 
     **Arguments:**
 
-    - `tracked`: the names of the arguments that contain functions of the user.
+    - `tracked`: the names of the arguments that contain the user's functions.
     """
 
     def decorator(function: Callable[..., T]) -> Callable[..., T]:

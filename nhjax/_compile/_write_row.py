@@ -61,7 +61,7 @@ def _jvp(primals, tangents, *, axis):
 
 
 def _transpose(cotangent, buffer, row, slot, *, axis):
-    # No earlier operation has written the row. Therefore its cotangent in the buffer
+    # No earlier operation has written the row. Therefore this row of the cotangent
     # need not be set to zero.
     of_buffer = cotangent if ad.is_undefined_primal(buffer) else None
     of_row = None
@@ -72,7 +72,7 @@ def _transpose(cotangent, buffer, row, slot, *, axis):
 
 def _batched(operands, axes, *, axis):
     if axes[2] is not None:
-        # Each member writes to its own slot.
+        # Members write to different slots, so that JAX's own update is used.
         return jax.vmap(partial(_written, axis=axis), axes)(*operands), 0
     pairs = list(zip(operands[:2], axes[:2], strict=True))
     size = next(x.shape[place] for x, place in pairs if place is not None)

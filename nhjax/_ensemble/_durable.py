@@ -38,7 +38,7 @@ def write(path: Path, content: bytes) -> None:
 
 
 def write_if_different(path: Path, content: bytes) -> None:
-    """Write a file if its content differs; otherwise delete a leftover temporary."""
+    """Write a file if its content differs; otherwise delete its temporary file."""
     if path.read_bytes() == content:
         _temporary(path).unlink(missing_ok=True)
     else:
@@ -156,7 +156,7 @@ class Journal:
         self._where = f"The store {str(folder.parent)!r}"
 
     def merge_parts(self) -> dict[int, Line]:
-        """Append all parts to the journal, and return its lines by chunk."""
+        """Move all parts into the journal, and return its lines by chunk."""
         complete, has_fragment = _complete_lines(self.path)
         if has_fragment:
             os.truncate(self.path, len(complete))

@@ -76,7 +76,7 @@ class Processes:
     def check_same_call(self, call: dict[str, Any]) -> None:
         """Raise in all processes if `call`, as JSON, differs between processes.
 
-        **Raises:** `ValueError` with the name of the first difference.
+        **Raises:** `ValueError` with the name of the first entry that differs.
         """
         calls = [json.loads(x) for x in self.allgather(json.dumps(call).encode())]
         for index, other in enumerate(calls):
@@ -112,7 +112,10 @@ class Processes:
 
 
 def check_equal_devices(owners: list[int]) -> None:
-    """Raise in all processes unless each owns the same number of devices."""
+    """Raise in all processes unless each owns the same number of devices.
+
+    `owners` lists the index of the process that owns each device.
+    """
     numbers = Counter(owners)
     if len(set(numbers.values())) > 1:
         listed = ", ".join(f"process {i} has {numbers[i]}" for i in sorted(numbers))

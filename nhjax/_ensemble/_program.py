@@ -47,10 +47,11 @@ class Layout(NamedTuple):
 
 
 class ChunkResult(NamedTuple):
-    """The result of a chunk: codes of `RESULTS`, failed steps, and its content.
+    """The result of a chunk: a code and a step for each member, and the content.
 
-    The content is the values of all members, or only the arrays of these values that
-    reductions use, or the states of reductions.
+    Codes and steps are results of `first_failure`. The content is the values of all
+    members, or only the arrays of these values that reductions use, or the states of
+    reductions.
     """
 
     codes: Int[Array, " c"]
@@ -102,7 +103,7 @@ class Job:
     ) -> ChunkResult:
         """Start a chunk that returns states of reductions; do not wait for it.
 
-        `is_used` is the result of `used_arrays`.
+        `is_used` marks the arrays that the reductions use; see `used_arrays`.
 
         The reductions are a separate program, which takes long to compile and depends
         only on the shapes of the values. Runs with different methods can therefore
@@ -170,7 +171,7 @@ class Members:
         self.make = _MemberFromArrays(treedef, tuple(keys))
 
     def inputs(self, start: int, size: int) -> Any:
-        """Return the inputs of `size` members; the last member pads the last chunk."""
+        """Return `size` rows from `start` on, padded by the row of the last member."""
         indices = np.minimum(np.arange(start, start + size), self.count - 1)
         if self._leaves is None:
             return indices.astype(jnp.result_type(int))
@@ -324,7 +325,7 @@ def used_arrays(reductions: Any, shapes: Any) -> tuple[bool, ...]:
 def _updated(
     reductions: Any, shapes: Any, values: Any, counts: Bool[Array, " c"]
 ) -> Any:
-    """Return the states of the reductions after the members of one chunk."""
+    """Return the states of the reductions for the members of one chunk alone."""
     return each_reduction(
         lambda each: each.update(each.init(shapes), values, counts), reductions
     )
@@ -516,7 +517,7 @@ def call_description(
 
 
 def program_text(job: Job, reductions: Any = ()) -> str:
-    """Write the jaxpr of one member and of the reductions.
+    """Return the text of the jaxprs of one member and of the reductions.
 
     The text ends with digests of the arrays in the jaxprs. Addresses of functions,
     which differ between processes, are removed.

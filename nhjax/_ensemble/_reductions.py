@@ -95,7 +95,7 @@ class Mean(AbstractReduction):
         return _Sums(one.number + other.number, _map(add, one.sums, other.sums))
 
     def finish(self, state: Any) -> PyTree[Array]:
-        """Divide by the number of members."""
+        """Divide the sums by the number of members."""
         count = int(np.asarray(state.number))
         return _map(lambda x: rounded(x) / count, state.sums)
 
@@ -175,7 +175,7 @@ class Variance(AbstractReduction):
         )
 
     def finish(self, state: Any) -> PyTree[Array]:
-        """Divide by the number of members minus `ddof`."""
+        """Divide the sums of squares by the number of members minus `ddof`."""
         count = int(np.asarray(state.number))
         if count <= self.ddof:
             raise ValueError(
@@ -208,7 +208,7 @@ class _AbstractExtreme(AbstractReduction):
     def update(
         self, state: PyTree[Array], values: PyTree[Array], counts: Bool[Array, " c"]
     ) -> PyTree[Array]:
-        """Compare with the members of a chunk."""
+        """Compare the state with the members of a chunk, and keep the best values."""
 
         def leaf(x):
             mask = counts.reshape(-1, *[1] * (x.ndim - 1))
@@ -569,7 +569,7 @@ class DoubleDouble(NamedTuple):
 
 
 def double_double(x: Float[Array, "*n"]) -> DoubleDouble:
-    """Convert a number exactly."""
+    """Convert a number exactly to a double-double number."""
     return DoubleDouble(x, jnp.zeros_like(x))
 
 
@@ -643,7 +643,7 @@ def _zeros(value: Any) -> Any:
 
 
 def _lifted(value: Any, counts: Bool[Array, ""]) -> Any:
-    """Convert the value of a member, or return zeros if it does not count."""
+    """Convert a value to double-double numbers, zeros if the member does not count."""
     return jax.tree.map(
         lambda x: double_double(jnp.where(counts, x, jnp.asarray(0, x.dtype))), value
     )

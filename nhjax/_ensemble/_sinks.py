@@ -90,11 +90,11 @@ class FailureList:
         self.rows += rows
 
     def to_bytes(self) -> bytes:
-        """Write the rows as 64-bit integers."""
+        """Return the rows as the bytes of 64-bit integers."""
         return np.array(self.rows, np.int64).tobytes()
 
     def add_bytes(self, data: bytes) -> None:
-        """Append rows that `to_bytes` has written."""
+        """Append rows that `to_bytes` has returned."""
         self.rows += np.frombuffer(data, np.int64).reshape(-1, 3).tolist()
 
     def outcome(
@@ -292,11 +292,11 @@ class ReductionSink(AbstractSink):
         return self.failures.outcome(count, statistics=statistics)
 
     def packed(self) -> bytes:
-        """Write the state and the failures as bytes."""
+        """Return the state and the failures as bytes."""
         return self._packed(self.state, self.failures)
 
     def restore(self, first_chunk: int, packed: bytes) -> None:
-        """Restore the state from packed bytes, to continue with this chunk."""
+        """Restore state and failures from `packed`, to continue with `first_chunk`."""
         self.first_chunk = first_chunk
         state, self.failures = self._unpacked(packed)
         self.state = self._placed(state)
@@ -310,7 +310,7 @@ class ReductionSink(AbstractSink):
             self.state, self.failures = self.neutral, FailureList()
             self._merge_round(own)
             return
-        # In the last round, some processes may have no chunk.
+        # A process without a chunk in the last round takes part with empty data.
         while self.rounds < -(
             -(self.job.num_chunks - self.first_chunk) // processes.count
         ):

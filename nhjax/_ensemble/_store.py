@@ -62,8 +62,8 @@ class ZarrSink(AbstractSink):
         resume: bool,
     ):
         self.job, self.given, self.path = job, path, Path(path).absolute()
-        # Other processes must not look for the folder before it exists: NFS would
-        # report it as missing for up to a minute.
+        # Only process 0 resolves links: to a process that looks for the folder before
+        # it exists, NFS would report it as missing for up to a minute.
         if job.processes.index == 0:
             self.path = self.path.resolve()
         self.where = f"The store {str(self.path)!r}"
@@ -122,7 +122,7 @@ class ZarrSink(AbstractSink):
             self.journal.append(line)
 
     def outcome(self) -> EnsembleOutcome:
-        """Finish the journal, and label the time axis if all members share it."""
+        """Finish the journal, label a common time axis, and create the outcome."""
         processes = self.job.processes
         self.journal.close()
         new = json.dumps([*self.journal.lines.values()]).encode()
@@ -311,7 +311,7 @@ class CheckpointedReductionSink(AbstractSink):
         return self.inner.start(chunk)
 
     def collect(self, chunk: int, content: Any, failures: list[list[int]]) -> None:
-        """Merge a chunk or a round of chunks, and write the state."""
+        """Merge a chunk or a round of chunks; process 0 then writes the state."""
         self.inner.collect(chunk, content, failures)
         processes = self.job.processes
         if processes.index > 0:
@@ -340,7 +340,7 @@ class CheckpointedReductionSink(AbstractSink):
 
     def _open(self, resume: bool) -> None:
         """Create the folder, or open it and read the state."""
-        # If a run is interrupted before it writes its manifest, it leaves only these.
+        # If a run is interrupted before it writes its manifest, only these files exist.
         early = {
             self.LOCK,
             self.PROGRAM,
@@ -388,7 +388,7 @@ class CheckpointedReductionSink(AbstractSink):
 def _check_resumable(
     where: str, folder: Path, names: tuple[str, ...], maker: str, resume: bool
 ) -> None:
-    """Raise unless a run may be resumed and its folder has these files.
+    """Raise unless `resume` is true and `folder` has all files in `names`.
 
     `where` names the folder, and `maker` the call that should have created it.
     """
@@ -459,7 +459,7 @@ def _program_difference(old: str, new: str) -> list[str]:
 
 
 def _empty_variables(job: Job) -> dict[str, Any]:
-    """Name the arrays of the values and their axes; the arrays have one empty row."""
+    """Return, by name, the axes and one uninitialised row of the arrays of values."""
     empty = jax.tree.map(lambda x: np.empty((1, *x.shape), x.dtype), job.structure)
     made = named_arrays(results_as_codes(empty), _BATCH)
     for name, (dims, x) in made.items():

@@ -547,7 +547,7 @@ def _attitude(name: str, *geoms: str, **options: Any) -> Looks:
 
 
 def _box_of(moments: Any) -> tuple[str, list[float]]:
-    """Return a marked box with the given moments of inertia, and its half lengths."""
+    """Return a marked box with moments of inertia in these ratios, and half lengths."""
     own = np.asarray(moments, float)
     squares = np.maximum(own.sum() / 2 - own, 0.02 * own.sum())
     half = (0.4 * np.sqrt(squares / squares.max())).tolist()
@@ -641,7 +641,7 @@ def _beads(machine: Any) -> Looks:
 
 
 def _transmission(machine: systems.ContinuouslyVariableTransmission) -> Looks:
-    """Show the driver as a pendulum, and the passenger on a blade that it steers."""
+    """Show the driver as a pendulum, and the passenger on a blade the driver steers."""
     pivot, top, foot = np.array([[0, 1.5, 1.2], [0, 1.7, 1.2], [0, 1.7, 0]])
 
     def poses(t, q, args):

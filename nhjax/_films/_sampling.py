@@ -133,7 +133,7 @@ def _between_rows(
 # The travel between two saved states is the mean of their velocities times the time
 # between them. The defect is the displacement minus the travel, relative to the travel.
 # A harmonic motion with four saved states in a period has the defect
-# tan(π/4) / (π/4) - 1 = 0.27.
+# tan(π/4) / (π/4) - 1 = 0.27, which is just too large.
 _LARGEST_DEFECT = 0.25
 
 

@@ -79,7 +79,7 @@ class Scene:
         self.data = self._mujoco.MjData(self.model)
 
     def _places(self, who: str, subject: Subject, q: Any) -> tuple[Any, Any, Any]:
-        """Return qpos, the poses of the bodies, and the model without additions.
+        """Return qpos, the poses of the bodies, and the model without added ground.
 
         For a robot, the poses are None; for a `Looks`, qpos is None.
         """
@@ -351,5 +351,5 @@ def _smoothed(centres: np.ndarray, times: np.ndarray) -> np.ndarray:
 
 
 def visible_geoms(model: Any) -> Sequence[int]:
-    """Return the geoms of the groups that MuJoCo shows."""
+    """Return the indices of geoms in the groups that MuJoCo shows by default."""
     return [i for i in range(model.ngeom) if model.geom_group[i] < 3]

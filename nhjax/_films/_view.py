@@ -57,7 +57,7 @@ class Show:
         """Show the machine at the frame nearest to a time."""
         k = int(np.argmin(np.abs(self._scene.times - t)))
         data = self._scene.data
-        # The callbacks of the slider and the playback run in different threads.
+        # Locked, because callbacks of the slider and the playback use two threads.
         with self._lock, self.server.atomic():
             self._scene.place(k)
             moved = self._scene.centres[k] - self._scene.centres[0]
@@ -150,7 +150,7 @@ def view(
 
 
 def _add_shapes(server: Any, scene: Scene) -> dict[int, Any]:
-    """Add all geoms and trails; return a dictionary from body numbers to frames."""
+    """Add all geoms and trails; return a coordinate frame for each body number."""
     mujoco, model = mujoco_of("nhjax.view", "view"), scene.model
     server.scene.set_up_direction("+z")
     extent = float(model.stat.extent)

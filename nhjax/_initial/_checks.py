@@ -33,7 +33,7 @@ class Found(NamedTuple):
     """A computed initial state, and the numbers that the checks need.
 
     - `lin`: the linearisation of the equations of motion at the state.
-    - `off_group`: the distance to the group of the given q, or of the projected q.
+    - `off_group`: the distance of q, given or projected, from its group.
     - `regularity`, `compatibility`: the reciprocal condition numbers of the metric on
         the fibre and of the compatibility matrix.
     - `ranks`, `deficient`: the constraint derivatives whose rank is checked, and
@@ -168,7 +168,7 @@ def list_checks(
 ) -> list[Check]:
     """List the conditions on an initial state, each with its exception.
 
-    `holds` is the result of `judge`.
+    `holds` has the result of `judge`: whether each condition holds.
     """
     name, given = ("p", p) if v is None else ("v", v)
     words, group = _WORDS[system.generator], f"{system.manifold_of(q)}"

@@ -166,7 +166,7 @@ def initial_state(
         if x is not None
     ]
     if throw:
-        # Only traced inputs are checked together with the solution, in one call-back.
+        # Check concrete inputs now, and traced ones with the solution in one call-back.
         inputs = undecided(*inputs)
     found, judged = _solve(system, t, q, v, p, args, project, keep)
     holds = [x if is_traced(x) else bool(x) for x in judged]
@@ -181,7 +181,7 @@ def initial_state(
 def _solve(
     system, t, q, v, p, args, project: bool, keep: tuple[Kept, Kept]
 ) -> tuple[Found, list[BoolScalar | np.bool_]]:
-    """Compute the state and the numbers for its checks, and judge them."""
+    """Compute a `Found`, and whether each of its checks holds."""
     system = with_kept_functions(system, t, q, p if v is None else v, args)
     given = system, t, q, v, p, args, project, keep
     # A large program compiles faster in parts. So does a program that calls LAPACK,
@@ -378,10 +378,10 @@ def _ranks_judged(
 def _inverse_legendre(
     system, t, q, given: Float[Array, " n"], args
 ) -> tuple[Float[Array, " n"], BoolScalar]:
-    """Find the u whose fibre derivative is the given p or v, and whether it exists."""
+    """Return the u whose fibre derivative is `given`, and whether it was found."""
     zero = jnp.zeros_like(given)
     # If the terms of the equation cancel, as at rest in a magnetic field, the round-off
-    # of u is proportional to these terms and not to u.
+    # of u is proportional to these terms and not to u: they give the scale.
     terms = jnp.abs(given) + jnp.abs(system.fibre_derivative(t, q, zero, args))
     scale = max_norm(jnp.abs(inverse(system.metric(t, q, zero, args))) @ terms)
     solved = root(

@@ -442,8 +442,8 @@ def _nearest(
     """
     jacobian = jax.jacrev(constraint)(x)
     size, terms = sizes(jacobian)
-    # Round-off of the constraint also changes y. If y is zero, this is the only
-    # round-off of y.
+    # The scale of y includes the effect of round-off in the constraint. If y is zero,
+    # this is the only round-off of y.
     reaction = inverse(metric) @ jacobian.T
     delassus = jacobian @ reaction
     if idle is not None:
@@ -460,7 +460,7 @@ def _nearest(
         value, pullback = jax.vjp(constraint, y)
         if idle is not None:
             value = value + idle * multiplier
-        # With this sign the derivatives are symmetric.
+        # With this sign of `value`, the Jacobian of this function is symmetric.
         return metric @ (y - x) - pullback(multiplier)[0], -value
 
     solved = root(

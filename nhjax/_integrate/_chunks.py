@@ -25,7 +25,8 @@ from ._checkpoint import MOST_STEPS
 from ._progress_meter import AbstractProgressMeter
 
 
-# The number of entries in the buffers of a chunk, and the limits of the number of rows.
+# The approximate number of array elements in the buffers of a chunk, and the limits of
+# the number of rows.
 _BUFFER_SIZE = 2**17
 _LEAST_ROWS, _MOST_ROWS = 16, 4096
 # Unless a progress meter sets the lengths of chunks, the first chunk has at most

@@ -87,9 +87,9 @@ def _noise_and_least_part(
         system.manifold_of(q),
         *(t, q, u, dt, value),
     )
-    # If the mass matrix is indefinite at one state, it is indefinite along the whole
-    # motion: an eigenvalue that changes its sign makes the matrix singular, which ends
-    # the run.
+    # The mass matrix is tested only at the initial state. It stays definite or
+    # indefinite along the motion, because an eigenvalue that changes its sign makes the
+    # matrix singular, which ends the run.
     t, q, u = stop_gradient((t, q, u))
     hessian = square_jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
     return noise, jnp.where(hessian.is_definite(), 0, LEAST_PART).astype(value.dtype)

@@ -87,14 +87,14 @@ def named_arrays(value: Any, batch: tuple[str, ...]) -> dict[str, Any]:
     """Name the arrays of a solution or of another tree, and their axes.
 
     The arrays of a solution have the names of `Solution.to_xarray`, with the times in
-    `t` and the codes of the result in `result`. Arrays of another tree are named by
-    their paths.
+    `t` and the codes of `Solution.result` in `result`. Arrays of another tree are named
+    by their paths.
 
     **Returns:** a dictionary from names to pairs of the dimensions, starting with
     `batch`, and the array.
     """
-    # Only a `Solution` has `stats`. The class itself cannot be imported here, because
-    # its module imports this module.
+    # A `Solution` is recognised by its `stats`. Its class cannot be imported here,
+    # because its module imports this module.
     if not hasattr(value, "stats"):
         return _named(value, batch, "value", None)
     made = {} if value.ts is None else _saved(value.ys, (*batch, "time"))

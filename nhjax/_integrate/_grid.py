@@ -85,7 +85,7 @@ class VariableGrid(eqx.Module):
 Grid: TypeAlias = TimeGrid | VariableGrid
 
 
-# This limit is also the default limit of diffrax, so that users of diffrax know it.
+# The default limit of attempted steps. It is also the default limit of diffrax.
 _MOST_STEPS = 4096
 _NEEDS_SIZE = (
     "`dt` is missing: nhjax.ConstantStepSize needs it. To let the size be chosen, pass "

@@ -353,7 +353,7 @@ def integrate(
 def _has_constant_steps(
     controller: AbstractStepSizeController, dt: Any, t1: FloatScalarLike | None
 ) -> bool:
-    """Return whether all steps have the same size, and their number is given."""
+    """Return whether all steps have the same size and `num_steps` ends the run."""
     is_constant = isinstance(controller, ConstantStepSize)
     return is_constant and t1 is None and np.ndim(dt) == 0
 
@@ -633,7 +633,7 @@ def _check_num_steps(num_steps: Any, needed_by: str | None) -> int | IntScalar:
 
     **Arguments:**
 
-    - `num_steps`: the argument of the user.
+    - `num_steps`: the user's argument.
     - `needed_by`: the name of an option that needs the number of steps when tracing,
         for instance because the shape of its output depends on it; None if no option
         needs it.
@@ -703,7 +703,7 @@ def _advancing(t0: FloatScalar, dt: FloatScalar) -> Check:
     # Concrete values are compared with NumPy, which is ten times faster than JAX.
     numpy: Any = jnp if is_traced(t0, dt) else np
     first, h = numpy.asarray(t0), numpy.asarray(dt)
-    # Infinite numbers are checked separately.
+    # Infinite numbers are checked separately, and need no warning here.
     with np.errstate(over="ignore", invalid="ignore"):
         ok = first + h != first
     return Check(ok, _standstill_error, (first, h))

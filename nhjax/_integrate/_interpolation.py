@@ -67,7 +67,7 @@ class DenseInterpolation(eqx.Module):
     t0: FloatScalar
     dt: FloatScalar
     records: StepRecord
-    # The number of steps whose records are valid, in a run with variable steps.
+    # The number of steps with valid records; None in a run with constant steps.
     count: Int[Array, ""] | None
     # The system and args are stored as a list of their arrays, a tuple of their other
     # leaves and the structure of the tree, because `jax.jit` and `jax.vmap` cannot
@@ -167,12 +167,12 @@ def step_among(
 def step_position(
     t: Float[Array, "*k"], t0: FloatScalar, dt: FloatScalar, num_steps: int
 ) -> tuple[Float[Array, "*k"], Bool[Array, "*k"]]:
-    """Return times in units of steps, and which of the times lie in the run.
+    """Return times as numbers of steps since t0, and which of them lie in the run.
 
     Times that lie outside of the run only by round-off count as inside.
     """
     position = (t - t0) / dt
-    # Times have rounding errors that are proportional to the largest time.
+    # The slack covers rounding errors, which are proportional to the largest time.
     steps = num_steps + jnp.abs(t0 / dt)
     slack = jnp.maximum(1e-6, 8 * jnp.finfo(t.dtype).eps * steps)
     return position, (position >= -slack) & (position <= num_steps + slack)

@@ -61,9 +61,9 @@ class Loop(eqx.Module):
     def _report(self, k: Int[Array, ""]) -> None:
         """Report the steps that are certain to be complete after iteration k.
 
-        A stepper may need more iterations than there are steps. The report assumes the
-        largest number of iterations, so that all members of a batch report the same
-        number of steps, and the meter is called once for all members.
+        A stepper may need more iterations than there are steps. The report counts the
+        surplus iterations as the first ones, so that all members of a batch report the
+        same number of steps, and the meter is called once for all members.
         """
         length = static_length(self.stepper.plain.num_steps)
         surplus = static_length(self.num_iterations) - length
@@ -103,15 +103,15 @@ class Loop(eqx.Module):
         return jax.eval_shape(rows)
 
     def moving(self, carry: AbstractCarry) -> AbstractCarry:
-        """Return the same carry, whose state has tangents if the run is differentiated.
+        """Return the same carry; in a differentiated run, its state has tangents.
 
-        These tangents may be zero.
+        With these tangents, which may be zero, JAX traces the body of the loop once.
         """
         state = with_zero_tangents(carry.step_state.state, self.stepper)
         return eqx.tree_at(lambda x: x.step_state.state, carry, state)
 
     def no_rows(self, carry: AbstractCarry) -> Rows:
-        """Return zeros as rows of an iteration after the end; `write` drops them."""
+        """Return rows of zeros; after the end, `write` puts them into the extra row."""
         rows = jax.tree.map(
             lambda x: jnp.zeros(x.shape, x.dtype), self.row_shapes(carry)
         )
@@ -145,7 +145,7 @@ class AbstractAdjoint(eqx.Module):
 
     @abstractmethod
     def run(self, loop: Loop, carry: AbstractCarry) -> _Run:
-        """Run all steps of the loop from `carry`; return its end and all saved rows."""
+        """Run the loop from `carry`; return the last carry and all saved rows."""
 
 
 def advance(loop: Loop, k: Int[Array, ""], state: _Run) -> _Run:
@@ -156,7 +156,7 @@ def advance(loop: Loop, k: Int[Array, ""], state: _Run) -> _Run:
 
 
 def iterate_steps(loop: Loop, start: Any, end: Any, state: _Run) -> _Run:
-    """Perform the iterations from `start` to before `end`, unless the run ends first.
+    """Perform iterations `start` to `end` - 1, or fewer if the run ends before.
 
     This loop cannot be differentiated in reverse mode if the run may end early.
     """
@@ -175,7 +175,7 @@ def iterate_steps(loop: Loop, start: Any, end: Any, state: _Run) -> _Run:
 
 
 def count(num_steps: int | Int[Array, ""]) -> Any:
-    """Convert a number of steps to int32 for a loop. A Python int stays static."""
+    """Return the bound of a loop: an int as a static int32, an array unchanged."""
     return np.int32(num_steps) if isinstance(num_steps, int) else num_steps
 
 
@@ -207,7 +207,7 @@ class DirectAdjoint(AbstractAdjoint):
     needs_log: ClassVar[bool] = False
 
     def run(self, loop: Loop, carry: AbstractCarry) -> _Run:
-        """Run all steps of the loop from `carry`; return its end and all saved rows."""
+        """Run the loop from `carry`; return the last carry and all saved rows."""
         state = (carry, loop.empty_rows(carry))
         if loop.stepper.may_end_early:
             return _run_until_over((loop, state), self)
@@ -220,8 +220,8 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
     The steps are divided into `checkpoints` blocks, and each block is divided in the
     same way, until a block has at most `checkpoints` steps. The reverse pass works in
     one block of each level at a time. For this block it stores the states at the starts
-    of the blocks of the next level. In a block of the last level, it stores the stages
-    of all steps. The default is two levels. Each level beyond the first costs another
+    of the smaller blocks in it. In a block of the last level, it stores the stages of
+    all steps. The default is two levels. Each level beyond the first costs another
     forward run. With L levels and num_steps = checkpoints^L the memory is
     O(L checkpoints).
 
@@ -266,16 +266,16 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
             )
 
     def run(self, loop: Loop, carry: AbstractCarry) -> _Run:
-        """Run all steps of the loop from `carry`; return its end and all saved rows."""
+        """Run the loop from `carry`; return the last carry and all saved rows."""
         if not isinstance(loop.num_iterations, int):
-            # Blocks are useful in reverse mode only, which needs a static length.
+            # Blocks serve only reverse mode, which needs a static number of iterations.
             return DirectAdjoint().run(loop, carry)
         if loop.stepper.may_end_early:
             return _run_until_over((loop, (carry, loop.empty_rows(carry))), self)
         return self.run_blocks(loop, (carry, loop.empty_rows(carry)))
 
     def run_blocks(self, loop: Loop, state: _Run) -> _Run:
-        """Run a known number of iterations in blocks."""
+        """Run a static number of iterations in nested blocks."""
         assert isinstance(loop.num_iterations, int)
         lengths = self._block_lengths(loop.num_iterations)
         steps: _Advance = partial(advance, loop)
@@ -302,7 +302,10 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
 
 
 def _block(advance: _Advance, length: int, stride: int, *, keep_all: bool) -> _Advance:
-    """Return a function that calls `advance` `length` times, `stride` steps apart."""
+    """Return a function that calls `advance` `length` times, `stride` steps apart.
+
+    Unless `keep_all`, the reverse pass stores only the states before these calls.
+    """
     one = advance if keep_all else jax.checkpoint(advance, prevent_cse=False)
 
     def block(k, state):
@@ -344,7 +347,7 @@ def _idle_after_the_end(loop: Loop) -> _Advance:
 
 @eqx.filter_custom_jvp
 def _run_until_over(arguments: tuple[Loop, _Run], adjoint: AbstractAdjoint) -> _Run:
-    """Iterate until the run is over, within its largest number of iterations."""
+    """Iterate until the run is over, at most `loop.num_iterations` times."""
     del adjoint
     loop, state = arguments
     start = jnp.zeros((), jnp.int32)
@@ -353,7 +356,7 @@ def _run_until_over(arguments: tuple[Loop, _Run], adjoint: AbstractAdjoint) -> _
 
 @_run_until_over.def_jvp
 def _run_until_over_jvp(primals, tangents):
-    # Reverse mode needs a loop of known length, whose last iterations are idle.
+    # Reverse mode needs a loop of known length: iterations after the end are idle.
     arguments, adjoint = primals
     rates, _ = tangents
 

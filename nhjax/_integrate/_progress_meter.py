@@ -65,7 +65,7 @@ class AbstractProgressMeter(eqx.Module):
         )
 
     def report_part(self, before: FloatScalar, after: FloatScalar) -> None:
-        """Report from inside a traced loop that a part of the run is done.
+        """Report from inside a traced loop the percentage done, if it has increased.
 
         `before` and `after` are the parts that are done before and after a step, from 0
         to 1. For a batch, the part of its slowest member is reported.
@@ -130,7 +130,7 @@ class TextProgressMeter(AbstractProgressMeter):
 
     def update(self, done: int, total: int) -> None:
         """Print the number of complete steps, after each tenth of the run."""
-        # Reports come after each hundredth of the run, not after each step.
+        # `done` grows by a hundredth of the run, and may skip the exact tenths.
         tenth, apart = max(1, total // 10), max(1, total // 100)
         if done == total or (done >= tenth and done % tenth < apart):
             print(f"{done} of {total} steps", flush=True)

@@ -49,7 +49,7 @@ class ReversibleAdjoint(AbstractAdjoint):
     needs_log: ClassVar[bool] = True
 
     def run(self, loop: Loop, carry: AbstractCarry) -> tuple[AbstractCarry, Rows]:
-        """Run all steps of the loop from `carry`; return its end and all saved rows."""
+        """Run the loop from `carry`; return the last carry and all saved rows."""
         return _run((loop, carry))
 
 
@@ -64,7 +64,7 @@ def _run_fwd(perturbed, arguments):
     # `_run` is not called here: it has a custom rule for reverse mode, which forward
     # mode cannot differentiate.
     carry, rows = DirectAdjoint().run(*arguments)
-    # The backward pass needs only the log, and the shapes of all buffers.
+    # Of the rows, the backward pass needs only the log, and the shapes of the others.
     shapes = jax.eval_shape(lambda: rows)
     return (carry, rows), (carry, shapes, rows.log)
 

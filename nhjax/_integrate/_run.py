@@ -191,7 +191,7 @@ def _stepper(
     t0, fn = grid.t0, options.fn
     dt, num_steps = grid.typical_size, grid.num_steps
     if isinstance(grid, VariableGrid):
-        # Steps that differ have no common size, and are not counted from an origin.
+        # Times of variable steps are not multiples of a size: the origin is only t0.
         num_steps = grid.most_steps
         origin = Origin(t0, jnp.zeros((), jnp.int32), jnp.zeros_like(t0))
         state = y0.state if isinstance(y0, Checkpoint) else y0
@@ -346,9 +346,9 @@ def _chunk(
     loop = Loop(stepper, saving, NoProgressMeter())
 
     def steps(loop: Loop, carry: AbstractCarry, log: Any, start: Any, end: Any):
-        # Entries of the linearisation that are constant in the first step are constant
-        # in all steps. To find these entries, the matrices are traced at the present
-        # state, but the compiled program does not compute them.
+        # Entries of the linearisation that are constants of the program in the first
+        # step are constant in all steps, and the compiler uses the constants. To find
+        # them, the matrices are traced at the present state, but are not computed.
         plain, state = loop.stepper.plain, carry.step_state.state
         u = plain.system.fibre_coordinate(state)
         given = plain.system, plain.time(0), state.q, u, plain.args
@@ -465,7 +465,7 @@ def run_in_chunks(
     saves_start = jax.device_put(np.array(saveat.t0))
     start = _started(*given, saves_start, captured=captured)
     if not all(isinstance(x.dtype, np.dtype) for x in jax.tree.leaves(start.saved)):
-        # Chunks cannot return random keys, because NumPy has no arrays of them.
+        # NumPy has no arrays of random keys: a run that saves keys is one program.
         return run(system, method, y0, whole, args, options, saveat, solver_options)
 
     def chunk(carry: AbstractCarry, log: Any, span: Array) -> _Chunk:
@@ -597,8 +597,8 @@ def _all_steps(
 ) -> tuple[PyTree[Array] | None, AbstractCarry, Rows]:
     """Take all steps; return the saved start, the last carry and the saved rows."""
     # If the steps call the function `fn` of `SaveAt`, their kernel also calls it for
-    # the start. Otherwise `fn` is called outside of this kernel, so that the engine
-    # that compiles the steps does not depend on `fn`.
+    # the start. Otherwise `fn` is called outside of this kernel, so that `fn` cannot
+    # change which engine (see `nhjax.engines`) compiles the steps.
     is_inside = bool(saveat.steps)
 
     def saved(loop: Loop, t0: FloatScalar, y: State) -> PyTree[Array] | None:

@@ -260,7 +260,7 @@ def record_places(
     if dense or sampled is None:
         return RecordPlaces(length, jnp.arange(length + 1, dtype=jnp.int32))
     # The buffer has one row for each sample, but samples in the same step share the row
-    # of the first such sample. There may be more or fewer steps than samples.
+    # of the first such sample.
     number = sampled.shape[0]
     slots = jnp.full((length + 1,), number, jnp.int32)
     first = slots.at[sampled].min(jnp.arange(number, dtype=jnp.int32))
@@ -386,7 +386,7 @@ class Saving(eqx.Module):
     def write(self, buffers: Rows, rows: Rows, k: Int[Array, ""]) -> Rows:
         """Write the rows of iteration k to their places.
 
-        Rows with an index of `num_steps` or more go to the extra row.
+        Rows that are not saved, such as rows after the last step, go to the extra row.
         """
 
         def put(buffer, row, slot):

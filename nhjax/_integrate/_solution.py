@@ -208,8 +208,9 @@ class Solution(eqx.Module):
         """List the runs that failed, each as (member, step, reason).
 
         `step` is the index of the step that failed, and `reason` is the message of the
-        run's member of `RESULTS`. `member` is None for a solution without a batch, an
-        index for a batch, and a tuple of indices for a batch of batches.
+        run's `result`; it may also name a coordinate. `member` is None for a solution
+        without a batch, an index for a batch, and a tuple of indices for a batch of
+        batches.
         """
         outcome = _outcome(self)
         if is_traced(*outcome):

@@ -101,7 +101,7 @@ class AbstractStepSizeController(eqx.Module):
         return False
 
     def checks(self) -> list[Check]:
-        """Return the checks of parameters of the controller that are traced."""
+        """Return the checks of the controller's traced parameters."""
         return []
 
     @abstractmethod
@@ -357,7 +357,7 @@ class PIDController(AbstractStepSizeController):
         return True
 
     def checks(self) -> list[Check]:
-        """Return the checks of tolerances that are traced."""
+        """Return the checks of traced tolerances."""
         if not is_traced(self.rtol, self.atol):
             return []
         rtol, atol = jnp.asarray(self.rtol), jnp.asarray(self.atol)
@@ -387,10 +387,11 @@ class PIDController(AbstractStepSizeController):
     def init(
         self, context: StepContext, t: FloatScalar, start: StepState
     ) -> tuple[FloatScalar, Memory, RESULTS]:
-        """Return `dt` or, if None, a size in which the state changes by one percent."""
+        """Return `dt` or, if None, a size that changes the state by one percent."""
         # Before the first step there are no earlier errors, sizes and growth rates. The
         # logarithms of the errors start as zero. The size starts as zero, so that no
-        # trend is predicted. The growth rates start as infinite, which means unknown.
+        # trend is predicted. The growth rates, explained in `local_error`, start as
+        # infinite, which means unknown.
         zero = jnp.zeros((), t.dtype)
         memory = zero, zero, zero, jnp.full(2, jnp.inf, t.dtype)
         if context.dt is not None:
@@ -412,7 +413,8 @@ class PIDController(AbstractStepSizeController):
         position = position_sizes(manifold, start.state.q, v)
         state = max_norm(position / in_position, u / in_fibre)
         rates = v / in_position, start.lin.acceleration / in_fibre
-        # Without an absolute tolerance, components that are zero have no scale.
+        # Without an absolute tolerance, components that are zero have no scale, and
+        # their rates are ignored.
         least = 2 * _smallest_scale(u)
         known = (
             jnp.where(scale > least, rate, 0)
@@ -436,7 +438,10 @@ class PIDController(AbstractStepSizeController):
     def _scales(
         self, context: StepContext, before: StepState, after: StepState
     ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        """Return atol + rtol |y| for the positions and for the fibre coordinates."""
+        """Return atol + rtol |y| for the positions and for the fibre coordinates.
+
+        |y| is the larger of the values before and after the step.
+        """
         system, dtype = context.system, before.state.p.dtype
         rtol, atol = (jnp.asarray(x, dtype) for x in (self.rtol, self.atol))
         # A relative tolerance alone would allow no error where the state is zero.
@@ -478,8 +483,8 @@ class PIDController(AbstractStepSizeController):
             jnp.asarray(x, dtype) for x in (self.factormin, self.factormax, self.safety)
         )
         estimate = jnp.where(is_known, error, jnp.inf)
-        # Sums of logarithms take less time than products of powers. An error below this
-        # bound already gives the largest factor.
+        # Sums of logarithms take less time than products of powers. Logarithms
+        # below `bound` are raised to it: it already gives the largest factor.
         bound = number * jnp.log(safety / most)
         error = jnp.log(jnp.maximum(error, float(jnp.finfo(dtype).tiny)))
         error = jnp.maximum(error, bound)
@@ -499,7 +504,7 @@ class PIDController(AbstractStepSizeController):
         factor = jnp.where(is_known, factor, least)
         following = self._limited(size * factor)
         # If a step was shorter than the chosen size, its error says little about the
-        # next step.
+        # next step, and must not make it smaller than the chosen size.
         chosen = jax.lax.stop_gradient(jnp.abs(attempt.chosen))
         is_shorter = size < (1 - 1e-9) * chosen
         kept = jnp.maximum(following, chosen)
@@ -602,7 +607,7 @@ class ReversibleController(AbstractStepSizeController):
             )
 
     def checks(self) -> list[Check]:
-        """Return the check of an ε that is traced."""
+        """Return the check of ε if it is traced, otherwise an empty list."""
         if not is_traced(self.eps):
             return []
         eps = jnp.asarray(self.eps)
@@ -651,7 +656,7 @@ class ReversibleController(AbstractStepSizeController):
     def _density(
         self, context: StepContext, t: FloatScalar, y: StepState
     ) -> tuple[FloatScalar, FloatScalar]:
-        """Compute Q and its logarithmic rate along the motion."""
+        """Compute Q and G = d/dt log Q along the motion."""
         system, args = context.system, context.args
         q, u = y.state.q, system.fibre_coordinate(y.state)
         manifold = system.manifold_of(q)
@@ -671,7 +676,7 @@ class ReversibleController(AbstractStepSizeController):
     def _size(
         self, context: StepContext, density: FloatScalar, rate: FloatScalar
     ) -> FloatScalar:
-        """Compute the size of the step after a node, from the density and its rate."""
+        """Compute the size of the step after a node, from ρ and G at the node."""
         eps = jnp.asarray(self.eps, density.dtype) * context.direction
         return eps / (density + 0.5 * eps * rate)
 
@@ -791,7 +796,8 @@ def fastest_frequency(
         jnp.zeros_like(u), u
     )
     # For a Lagrangian system the metric is M. For a Hamiltonian system it is M⁻¹, and
-    # the derivative of dp/dt with respect to q is a bilinear form, not a linear map.
+    # the derivative of dp/dt with respect to q is a bilinear form, whose norm has M⁻¹
+    # on both sides.
     metric = system.metric(t, q, u, args)
     inverse_metric = inverse(metric)
     other = inverse_metric if system.fibre_coordinate_name == "v" else metric

@@ -328,7 +328,10 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
     def one_step(
         self, step_state: StepState, t: FloatScalar, h: FloatScalar, skip: BoolScalar
     ) -> StepOutcome:
-        """Take one step of size h from t. A negative h integrates backwards in time."""
+        """Take one step of size h from t; a negative h integrates backwards in time.
+
+        If `skip` is true, the step is not solved, and its outcome must not be used.
+        """
         start = step_state.differentiated_in_state()
         given = self.system, t, h, start, self.args, self.invariants, self.noise
         arguments = StepArguments(*given)
@@ -414,7 +417,7 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
 class PlainReverseReplay(AbstractReverseReplay[PlainCarry, None]):
     """The replay of a run with constant steps and without events.
 
-    The index of a step gives its start time.
+    The index of a step gives its times, so that no log is needed.
     """
 
     stepper: PlainStepper

@@ -97,7 +97,10 @@ class StepSizes(eqx.Module):
     def first_clock(
         self, plain: PlainStepper, y0: State | Checkpoint, start: StepState
     ) -> tuple[Clock, RESULTS]:
-        """Return the clock before the first step, and whether the run can start."""
+        """Return the clock before the first step, and whether the run can start.
+
+        If a checkpoint has the data of such a controller, the run continues with them.
+        """
         t, context = plain.time(0), self.context(plain)
         size, memory, result = self.controller.init(context, t, start)
         compensation = jnp.zeros_like(t)
@@ -143,8 +146,8 @@ class StepSizes(eqx.Module):
     ) -> Clock:
         """Return the clock after an attempt.
 
-        `end` is the time after the step with its rounding error, and `num_steps` is the
-        number of completed steps.
+        After a rejected attempt, only `size` is new. `end` is the time after the step
+        with its rounding error, and `num_steps` is the number of completed steps.
         """
         t, compensation = end
         if self.t1 is not None:
@@ -382,7 +385,7 @@ def statistics_of_attempt(
     rejected: BoolScalar,
     accepted: BoolScalar,
 ) -> Statistics:
-    """Update, after an attempt, the statistics that only variable steps have."""
+    """Return the statistics that only variable steps have, updated by an attempt."""
     more: Statistics = {}
     counted = {
         "num_rejected_steps": rejected,
@@ -421,7 +424,7 @@ class VariableReverseReplay(AbstractReverseReplay[VariableCarry, StepLogEntry]):
     def back(
         self, following: StepLogEntry, step_state: StepState, i: Int[Array, ""]
     ) -> tuple[StepLogEntry, StepState]:
-        """Find the state that step i started from."""
+        """Find the log entry of step i, and the state that the step started from."""
         del following
         entry = self._entry(i)
         interval = StepInterval(entry.t, entry.t + entry.size, entry.size)

@@ -331,7 +331,7 @@ def framed(group: AbstractLieGroup, q: PyTree[Array]) -> PyTree[Array]:
     The methods `act`, `act_back` and `tangent` of the group accept such an element. An
     element without planar poses is returned unchanged.
     """
-    # A subclass may override methods with versions that do not support framed poses.
+    # Subclasses are excluded: their own methods may not support framed poses.
     if type(group) is SE2:
         return FramedPose(q, jnp.cos(q[2]), jnp.sin(q[2]))
     if type(group) is ProductGroup:

@@ -1,7 +1,7 @@
 """The retractions of groups of rotations and rigid motions, and their scalar functions.
 
-All scalar functions are smooth at the angle zero. They are functions of a square, so
-that no square root is differentiated at zero.
+All scalar functions are smooth at the angle zero. Instead of the length of a vector,
+they take its square, so that no square root is differentiated at zero.
 """
 
 from abc import abstractmethod
@@ -56,7 +56,7 @@ class AbstractRetraction(eqx.Module):
     def rotation_vector(
         self, w: FloatScalar, v: Float[Array, "3"]
     ) -> Float[Array, "3"]:
-        """Compute the shortest ω for which τ(ω) is the rotation of (w, v)."""
+        """Compute the shortest ω whose rotation τ(ω) is the quaternion (w, v)."""
 
     @abstractmethod
     def dtau_coefficients(
@@ -267,8 +267,8 @@ def _horner(coefficients, x):
 def arctan_ratio(x: FloatScalar) -> FloatScalar:
     """Compute arctan(√x)/√x for 0 <= x <= 1.
 
-    Halving the angle twice reduces √x to at most tan(π/16), where one short series is
-    accurate. There is no branch, so that derivatives of all orders exist.
+    Halving the angle arctan(√x) twice reduces √x to at most tan(π/16), where one short
+    series is accurate. There is no branch, so that derivatives of all orders exist.
     """
     scale = 1.0
     for _ in range(2):

@@ -1,12 +1,13 @@
 """The methods: Lobatto IIIA-IIIB, Gauss, and partitioned methods from any tableau.
 
-A step of a system with constraints has s multipliers Λ^1, ..., Λ^s. The constraint at
-stage 1 holds by hypothesis H1, which leaves s - 1 equations per constraint. A
-multiplier closure writes the multipliers in terms of s - 1 unknowns y,
+A step has s multipliers Λ^1, ..., Λ^s per constraint. The constraint at stage 1 holds
+by hypothesis H1, which leaves s - 1 equations per constraint. A multiplier closure
+writes the multipliers in terms of s - 1 unknowns y, and of multipliers λ_k and λ_{k+1}
+at the ends of the step,
 
     (Λ^1, ..., Λ^s) = start λ_k + end λ_{k+1} + E y.
 
-The leading part of the constraints' linearisation is then A_{2:,:} E.
+With A = (a_ij), the leading part of the constraints' linearisation is then A_{2:,:} E.
 """
 
 import abc
@@ -144,7 +145,7 @@ class AbstractMethod(eqx.Module):
 
         With p and r as for `order`, it is min(p, 2r + 2), but at most the order without
         constraints. For collocation on nodes that include 0 and 1, such as Lobatto's,
-        the page on closures proves that the order is at least 2r + 2; runs of many
+        the page on closures proves that the order is at least 2r + 2; runs with many
         tableaux show that it is not higher.
 
         **Raises:** `ValueError`, as `require_constraint_hypotheses` does.
@@ -173,7 +174,7 @@ class AbstractMethod(eqx.Module):
 
         With `closure="propagated"` this order is the smaller of q in C(q) and Q in
         CĈ(Q). One is subtracted if R_A(∞) = 1. The result is then rounded up to an even
-        number if the method is symmetric, and limited to `constrained_order`. Runs of
+        number if the method is symmetric, and limited to `constrained_order`. Runs with
         many tableaux confirm this rule. (The paper's theorem on global convergence has
         q in place of the smaller of q and Q, which is the same for Lobatto's nodes.)
         With the other closures the multiplier is the continuous multiplier, which has

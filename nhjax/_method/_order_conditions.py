@@ -208,7 +208,7 @@ def stability_at_infinity(t: Tableau) -> float:
 
 
 class _Branch(NamedTuple):
-    """A tree τ and the edge to its root: the numbers |τ|, γ(τ) and Σ_j a_ij φ_j(τ)."""
+    """A tree τ and the edge to its root: |τ|, γ(τ) and Σ_j a_ij φ_j(τ), with a or â."""
 
     size: int
     gamma: int

@@ -31,7 +31,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 
-# mpmath creates the classes of numbers and matrices for each context.
+# There are no static types: mpmath creates its classes for each context.
 Number: TypeAlias = Any
 Matrix: TypeAlias = Any
 
@@ -145,7 +145,7 @@ def _collocation(points: list[Number]) -> Tableau:
     nodes = [(1 + x) / 2 for x in points]
     k = lagrange_in_legendre(nodes)
     integrals = context().matrix([_integrated_legendre(s - 1, x) for x in points])
-    # Only P_0 has a nonzero integral over [0, 1].
+    # b_j is K_0j, because only P_0 has a nonzero integral over [0, 1].
     b = [(k[0, j] + k[0, s - 1 - j]) / 2 for j in range(s)]
     raw = integrals * k
     a = context().matrix(s, s)
@@ -267,7 +267,7 @@ def lobatto_points(stages: int) -> list[Number]:
 
     def derivative(x: Number) -> tuple[Number, Number]:
         p = legendre(n, x)
-        # (1 - x²) P_n' = n (P_{n-1} - x P_n) and Legendre's equation for P_n''.
+        # P_n' by (1 - x²) P_n' = n (P_{n-1} - x P_n), P_n'' by Legendre's equation.
         first = n * (p[n - 1] - x * p[n]) / (1 - x * x)
         return first, (2 * x * first - n * (n + 1) * p[n]) / (1 - x * x)
 
@@ -317,7 +317,7 @@ def _newton(f: Callable[[Number], tuple[Number, Number]], guess: float) -> Numbe
 
 
 def _mirrored(right: list[Number], count: int) -> list[Number]:
-    """Build all points, symmetric and increasing, from the positive points."""
+    """Build all points, symmetric and increasing, from the decreasing positive ones."""
     centre = [context().mpf(0)] if count % 2 else []
     return [-x for x in right] + centre + right[::-1]
 
@@ -414,7 +414,7 @@ def integrated_lagrange(t: Tableau, theta: ArrayLike) -> Float[Array, "*batch s"
     linear = _combine([fraction], coefficients[:1])
     if t.stages == 1:
         return linear
-    # P_1', P_2', ... are the Gegenbauer polynomials C^(3/2).
+    # P_1', P_2', ... are Gegenbauer polynomials C^(3/2), which have this recurrence.
     d = [jnp.ones_like(x), 3 * x]
     for n in range(2, t.stages - 1):
         d.append(((2 * n + 1) * x * d[n - 1] - (n + 1) * d[n - 2]) / n)

@@ -44,7 +44,10 @@ def read_lagranges_method(method: Any) -> Description:
 
 
 def read_kanes_method(method: Any, potential: Any) -> Description:
-    """Read a `KanesMethod` that has bodies."""
+    """Read a `KanesMethod` that has bodies.
+
+    If `potential` is None, the potential energy is the sum over the bodies.
+    """
     coordinates = check_coordinates(method.q)
     speeds = list(method.u)
     if len(speeds) != len(coordinates):
@@ -209,7 +212,7 @@ def _value_of(name: str) -> Any:
 
 
 def _connected_points(point: Any) -> list[Any]:
-    """List the points whose positions relative to `point` are known."""
+    """List `point`, and the points whose positions relative to it are known."""
     found = [point]
     for known in found:
         found += [other for other in known._pos_dict if other not in found]
@@ -277,7 +280,7 @@ def check_coordinates(coordinates: Any) -> list[Any]:
 
 
 def generalised_forces(forces: Any, coordinates: list[Any], frame: Any) -> list[Any]:
-    """Return the generalised force of each coordinate, or an empty list."""
+    """Return the generalised force of each coordinate; an empty list for None."""
     if forces is None:
         return []
     if isinstance(forces, Mapping):

@@ -162,9 +162,9 @@ def from_sympy(
     **Raises:** `ImportError` without SymPy (`pip install "nhjax[sympy]"`); `TypeError`
     and `ValueError` that name the part that cannot be imported, such as a function of
     time that is not a coordinate, an acceleration, a function that the printer does not
-    know, a constraint without coordinates, or a KanesMethod whose energy contains a
-    substituted constraint. At run time, an error names missing and unknown parameters
-    in `args`.
+    know, a constraint without coordinates, or a KanesMethod in which a constraint was
+    substituted into the velocity of a body. At run time, an error names missing and
+    unknown parameters in `args`.
 
     !!! example
 
@@ -334,11 +334,11 @@ def compile_expressions(
 def _lambdify(
     given: list[Any], symbols: Symbols, of_rates: bool
 ) -> Callable[..., list[Any]] | None:
-    """Build a function of the expressions, or return None if JAX cannot trace it."""
+    """Return a function that computes scalar expressions, or None if this fails."""
     t = mechanics().dynamicsymbols._t
     rates = symbols.rates if of_rates else []
     inputs = [t, *symbols.coordinates, *rates, *symbols.parameters]
-    # A part of an integral contains the integration variable as a further symbol.
+    # If `given` is a part of an integral, the integration variable is a further input.
     inputs += sorted(set().union(*(x.free_symbols for x in given)) - {*inputs}, key=str)
     scalar = jax.ShapeDtypeStruct((), jnp.result_type(float))
     # Any exception, in the printer or in the code that it wrote, means that the model
@@ -357,7 +357,7 @@ def _lambdify(
 
 
 def _first_unsupported_part(given: list[Any], symbols: Symbols) -> str:
-    """Return the name of the smallest part that cannot be computed."""
+    """Describe the first, innermost part that `_lambdify` cannot compute."""
     back = {symbol: of for of, symbol in symbols.of.items()}
     for whole in given:
         for part in sympy().postorder_traversal(whole):
@@ -414,7 +414,8 @@ def components(name: str, x: Any, names: tuple[str, ...]) -> tuple[Array, ...]:
 def printer() -> Any:
     """Create SymPy's printer for JAX, modified to print all digits of floats.
 
-    SymPy's own printer prints 15 digits, and integers that are too large for JAX.
+    SymPy's own printer prints 15 digits, and integers that are too large for JAX; here
+    these integers become floats.
     """
     base = importlib.import_module("sympy.printing.numpy").JaxPrinter
 
@@ -425,7 +426,7 @@ def printer() -> Any:
         def _print_Integer(self, expr):
             return str(expr.p) if abs(expr.p) < 2**31 else repr(float(expr.p))
 
-    # `lambdify` uses the same settings.
+    # `lambdify` gives its own printer the same settings.
     settings = {"fully_qualified_modules": False, "inline": True}
     return Printer(settings | {"allow_unknown_functions": True})
 
@@ -491,7 +492,7 @@ def _of_position(
 
 
 def _check_constraints(model: Description, symbols: Symbols) -> None:
-    """Raise for constraints of the wrong kind, or without coordinates."""
+    """Raise for a constraint without coordinates, or passed as the wrong argument."""
     positions, velocities = set(symbols.coordinates), set(symbols.rates)
     for name, group in (
         ("nonholonomic", model.nonholonomic),
@@ -525,7 +526,7 @@ def _name(x: Any) -> Any:
 
 
 def _by_name(where: str, given: Mapping[Any, Any]) -> dict[str, Any]:
-    """Replace symbols and coordinates q(t) by their names as keys of a dictionary."""
+    """Replace the keys of a dictionary, symbols or coordinates q(t), by their names."""
     values = {}
     for key, value in given.items():
         name = str(_name(key))

@@ -4,8 +4,7 @@ For matrices of a few rows, calling a library of linear algebra is too expensive
 a time loop the calls cost more than the arithmetic. The calls cannot be compiled into
 one kernel with the operations around them, and a batch of calls runs one by one. Up to
 a size limit, `small_einsum` therefore consists of elementary operations.
-`with_small_products` replaces the products in the functions of a user by
-`small_einsum`.
+`with_small_products` replaces the products in the user's functions by `small_einsum`.
 """
 
 import math
@@ -78,7 +77,7 @@ def _contract_axes(dimension_numbers, a: Array, b: Array) -> Array:
 
 
 def with_small_products(program: Any) -> Callable[..., list[Any]]:
-    """Return the function of a jaxpr, with small matrix products written out."""
+    """Return a jaxpr as a function that computes products by `small_einsum`."""
 
     def run(*args):
         return _evaluated(program.jaxpr, program.consts, args)

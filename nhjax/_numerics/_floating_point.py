@@ -1,4 +1,4 @@
-"""The sizes of arrays, and the round-off of sums and of functions."""
+"""The max norm of arrays, and the round-off of sums and of functions."""
 
 import math
 from collections.abc import Callable
@@ -16,8 +16,8 @@ from .._custom_types import FloatScalar, FloatScalarLike
 def max_norm(*arrays: Array) -> FloatScalar:
     """Compute max |x| over arrays: NaN if any number is NaN, 0 if all are empty.
 
-    The maximum is taken over the bit patterns, which have the same order as the
-    nonnegative numbers, with NaN above infinity. A maximum of floats that propagates
+    The maximum is taken over the bit patterns of |x|, which have the same order as the
+    numbers |x|, with NaN above infinity. A maximum of floats that propagates
     NaN takes five dependent instructions, and a maximum of integers takes two. With
     maxima of floats, these norms took a third of the time of a stage iteration.
     """
@@ -37,7 +37,7 @@ def largest_column(*arrays: Float[Array, "_ n"]) -> tuple[FloatScalar, Int[Array
     The last bits of each bit pattern are replaced by the index of its column, so that
     one maximum finds the value and the column; the value loses these bits. A separate
     search for the column took a tenth of the time of a step. If some numbers are NaN,
-    the result is a column that contains NaN.
+    the value is NaN, and the column contains NaN.
     """
     columns = arrays[0].shape[1]
     mask = (1 << max(columns - 1, 0).bit_length()) - 1
@@ -158,8 +158,8 @@ def measured_noise(
     rays = jnp.asarray(rays.reshape(-1, size), dtype)
     lengths = [math.prod(x.shape) for x in jax.tree.leaves(like)]
 
-    # The program of a `while` loop contains the function only once. XLA may unroll a
-    # short `scan`.
+    # A `while` loop is used, because its program contains the function only once. XLA
+    # may unroll a short `scan`.
     def on_ray(_, ray):
         def add(carry):
             k, total = carry
@@ -185,6 +185,6 @@ def measured_noise(
 
 
 def _weights(order: int) -> np.ndarray:
-    """Return the weights of a difference, scaled so that their squares sum to 1."""
+    """Return weights of a difference of this order, whose squares sum to 1."""
     weights = np.array([(-1.0) ** k * math.comb(order, k) for k in range(order + 1)])
     return weights / np.linalg.norm(weights)

@@ -29,8 +29,8 @@ from ._iteration import dense_increment, iterate, Solved, UpdateNorms
 
 # Terms of the Neumann series below this many units of round-off are left out.
 _UNITS_LEFT = 256
-# The path to a root is divided into `_PARTS_OF_PATH` parts, with
-# `_ITERATIONS_OF_PART` iterations in each part.
+# `root` divides its `path` into `_PARTS_OF_PATH` parts, with `_ITERATIONS_OF_PART`
+# iterations in each part.
 _PARTS_OF_PATH, _ITERATIONS_OF_PART = 32, 3
 # If the terms of the series stop falling above this many units of round-off, the series
 # does not converge. The derivative is then NaN rather than a wrong number.
@@ -108,7 +108,7 @@ def fixed_point_tangent(
 ) -> X:
     """Compute how a fixed point x = G(θ, x) changes with the parameters θ.
 
-    The change solves dx = ∂G/∂x dx + ∂G/∂θ dθ, by `solve_contraction`.
+    `solve_contraction` solves dx = ∂G/∂x dx + ∂G/∂θ dθ for the change dx.
 
     **Arguments:**
 
@@ -341,11 +341,11 @@ def has_tangent(tangents: PyTree[Any]) -> PyTree[bool]:
 def with_zero_tangents(tree: X, parameters: PyTree[Any]) -> X:
     """Return the same tree, in which each array has a tangent, which may be zero.
 
-    If no parameter has a tangent, the tree does not change.
+    If no array of `parameters` or of the tree has a tangent, none is added.
 
     JAX traces the body of a loop again if a part of the carry has no tangent at first,
-    but has a tangent after an iteration. If the initial carry has tangents of zeros,
-    JAX traces the body once.
+    but has a tangent after an iteration. If all parts of the initial carry have
+    tangents, JAX traces the body once.
     """
     parameters = jax.tree.leaves(eqx.filter(parameters, eqx.is_inexact_array))
     inexact, others = eqx.partition(tree, eqx.is_inexact_array)

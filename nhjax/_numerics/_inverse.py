@@ -132,8 +132,8 @@ def _by_program(matrix: Array, *, program: Any) -> Array:
 def _inverse_by_rows(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
     """Compute the same inverse as `compiled_once_inverse`, in loops over single rows.
 
-    This function keeps its matrices in memory. Therefore `nhjax.lanes` cannot compile
-    it as a separate function, because the arguments would be single numbers.
+    `nhjax.lanes` cannot compile this function as a separate function, whose arguments
+    would be single numbers, because this function keeps its matrices in memory.
     """
     size = matrix.shape[0]
     numbers = jnp.arange(size, dtype=jnp.int32)

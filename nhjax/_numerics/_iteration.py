@@ -30,7 +30,7 @@ _GROWTH, _GROWTH_IF_SLOW = 30.0, 2.0
 # An iteration counts as divergent if an increment is larger than this factor times the
 # sum of the size of x and the first increment.
 _HOPELESS = 1e6
-# An upper bound on the magnification of round-off by the problem.
+# The problem is assumed to magnify round-off by at most this factor.
 _LARGEST_NOISE = 1e5
 # Convergence counts as slow after more than this many iterations.
 _SLOW = 100
@@ -112,7 +112,7 @@ def iterate(
     noise_units: float | None = None,
     skip: Bool[Array, ""] | bool = False,
 ) -> Solved[X, Aux]:
-    """Repeat `iteration` until its increments no longer fall.
+    """Repeat `iteration` until it has converged, diverged or reached `max_iterations`.
 
     `iteration(x)` returns the next iterate, the sizes of the increment and of the
     iterate, and auxiliary values at x. Increments are measured relative to the size of
@@ -120,8 +120,8 @@ def iterate(
     zero. If both are zero, increments are measured relative to the first increment.
     `round_off` is the size of data that are larger than x: their round-off adds to the
     round-off of x, so that `scale` plus `round_off` replaces `scale`, except for the
-    tolerance. `noise` is a measured size: increments always contain errors of about the
-    unit round-off times `noise`.
+    tolerance. `noise` measures the errors that increments always contain: they are
+    about the unit round-off times `noise`. If `skip`, x is returned as converged.
 
     The iteration ends
 
@@ -203,7 +203,7 @@ def _progress(rules: _Rules, before: _Progress, sizes: UpdateNorms) -> _Progress
     if rules.max_iterations > _SLOW:
         # An iteration that reaches round-off after n iterations contracts by about
         # eps^(1/n). The error that it leaves is larger than an increment, by a factor
-        # that grows with n.
+        # that grows with n. `left` estimates this error.
         left = increment * jnp.maximum(1, count.astype(increment.dtype) / _SLOW)
     # Only increments that can be noise raise the level `believed`. Larger increments
     # also rise and fall if an iteration spirals towards the solution.
@@ -221,7 +221,8 @@ def _progress(rules: _Rules, before: _Progress, sizes: UpdateNorms) -> _Progress
     converged = small | stagnant
     is_last = count >= rules.max_iterations
     if rules.max_iterations > _SLOW:
-        # Noise that is nearly as large as x says nothing about convergence.
+        # Noise that is nearly as large as x says nothing about convergence, so that the
+        # noise is bounded here.
         eps = float(jnp.finfo(increment.dtype).eps)
         limit = _LAST_UNITS * jnp.minimum(rules.noise, _LARGEST_NOISE * eps * measure)
         converged = converged | (is_last & (increment <= limit))
@@ -244,7 +245,7 @@ def dense_increment(
     x: Float[Array, " k"],
     solve: Callable[[Array, Array], Array] = jnp.linalg.solve,
 ) -> tuple[Float[Array, " k"], Aux]:
-    """Compute the Newton increment -J⁻¹ r at x with the exact J by autodiff."""
+    """Compute the Newton increment -J⁻¹ r at x, with J by autodiff, and `aux`."""
     jacobian, r, aux = jacobian_and_value(residual, x)
     return solve(jacobian, -r), aux
 

@@ -1,4 +1,4 @@
-"""Functions of a user that are traced and differentiated once.
+"""The user's functions, each traced and differentiated once.
 
 A run needs the Lagrangian of a system and its derivatives at more than ten places. JAX
 would trace and differentiate the Lagrangian again at each place, which would take most
@@ -39,7 +39,7 @@ _MOST_FUNCTIONS = 32
 
 
 class KeptFunction(eqx.Module):
-    """A traced function as one operation. It is a tree whose leaves are its arrays.
+    """A traced function as one operation: a tree of the arrays that it closes over.
 
     Call an instance with trees that have the structure of the example with which the
     function was traced. Leaves that are not arrays always have the values that they
@@ -172,7 +172,7 @@ class _Program:
     def derived(self, key: Any, function: Any, operands: Sequence[Any]) -> "_Program":
         """Return the program of a function derived from this program.
 
-        `key` identifies the function.
+        It is traced at the first call. `key` identifies the function.
         """
         kinds = tuple(map(_kind, operands))
         if (key, kinds) not in self._derived:

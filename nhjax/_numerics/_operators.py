@@ -289,7 +289,7 @@ class WeightedTranspose(AbstractOperator):
         return self.weights[:, None] * self.matrix.as_matrix().T
 
     def first_columns(self, count: int) -> "WeightedTranspose":
-        """Return the first `count` columns; `count` must include all columns."""
+        """Return self; `count` must be the number of all columns."""
         assert count == self.matrix.pattern.shape[0]
         return self
 
@@ -308,7 +308,7 @@ class BlockTridiagonalInverse(AbstractOperator):
     There are q unknowns and q residuals for each of the l rows of the pattern. Unknowns
     and residuals are arrays of shape (q, l), or vectors of length q l. Blocks are
     eliminated from the first to the last. With the diagonal, lower and upper blocks
-    D_k, L_k and U_k of row k, and
+    D_k, L_k and U_k of block row k, and
 
     P_k = D_k - L_k P_{k-1}⁻¹ U_{k-1},
 
@@ -460,8 +460,9 @@ def jacobian_by_rows(
 
 
 def _unit_vectors(u: Float[Array, " n"]) -> Float[Array, "n n"]:
-    # `nhjax.lanes` omits products with zeros that pad an array. It could not omit
-    # products with the zeros of `jnp.eye`, because the other factor may be infinite.
+    # The rows are padded, because `nhjax.lanes` omits products with zeros that pad an
+    # array. It could not omit products with the zeros of `jnp.eye`, because the other
+    # factor may be infinite.
     n, one, zero = u.shape[0], jnp.ones((1,), u.dtype), jnp.zeros((), u.dtype)
     rows = [jax.lax.pad(one, zero, [(k, n - 1 - k, 0)]) for k in range(n)]
     return jnp.stack(rows)
@@ -615,9 +616,9 @@ def block_tridiagonal_inverse(
     count = -(-size // (3 * g)) * 3
     ordered = static_take(products, pattern.order)
     ordered = jnp.pad(ordered, (*[(0, 0)] * 4, (0, count * g - size)))
-    # The axes: equation, unknown; for the column, its block number modulo three and its
-    # place in the block; for the row, its group of three blocks, its block inside the
-    # group, and its place in the block.
+    # The axes of `split`: equation, unknown; for the column, its block number modulo
+    # three and its place in the block; for the row, its group of three blocks, its
+    # block inside the group, and its place in the block.
     split = ordered.reshape(q, q, 3, g, count // 3, 3, g)
 
     def diagonal(offset):

@@ -2,10 +2,10 @@
 
 Constraints are independent if the rows of their Jacobian B are independent. A
 `RankCondition` is a Jacobian whose rank must be full, `reciprocal_condition` measures
-how close the rows are to being dependent, and `dependent_rows` lists the rows for an
-error message. Where redundant constraints are allowed, `least_norm_inverse` replaces
-the inverse of C = B K⁻¹ Bᵀ, in which K is the mass matrix or its inverse. The result
-solves C x = b with the least norm of x.
+how close the rows are to being dependent, and `dependent_rows` lists the dependent rows
+for an error message. Where redundant constraints are allowed, `least_norm_inverse`
+replaces the inverse of C = B K⁻¹ Bᵀ, in which K is the mass matrix or its inverse. It
+gives the solution x of C x = b with the least norm.
 """
 
 from typing import NamedTuple
@@ -42,7 +42,7 @@ class RankCondition(NamedTuple):
 
 
 def active_ranks(ranks: list[RankCondition]) -> list[RankCondition]:
-    """Return at most one matrix of each shape: the active matrix, if there is one.
+    """Return one condition for each shape of Jacobian, an active one if there is one.
 
     Singular values are more expensive than all other operations here, so that they are
     computed for as few matrices as possible.
@@ -150,7 +150,7 @@ NEARLY_DEPENDENT = 1e-4
 def least_norm_inverse(
     matrix: Float[Array, "l l"], negligible: float | None = None
 ) -> Float[Array, "l l"]:
-    """Compute the generalised inverse X of a symmetric matrix C with the least norm.
+    """Compute the generalised inverse X of a symmetric C for least-norm solutions.
 
     If C x = b has solutions, X b is the solution x with the least Σ C_aa x_a². The
     result is X = D (D C D)⁺ D with D = diag(C_aa)^(-1/2). Eigenvalues of D C D count
@@ -198,14 +198,14 @@ def least_norm_inverse_by_blocks(
 
 
 def rank_of_gram(matrix: Float[Array, "l l"]) -> Int[Array, ""]:
-    """Count the eigenvalues that are not negligible in `least_norm_inverse`."""
+    """Return the rank: the number of eigenvalues that are not negligible."""
     if matrix.shape[0] == 0:
         return jnp.zeros((), int)
     return jnp.sum(_eigenvalues(matrix)[1])
 
 
 def reciprocal_condition_of_range(matrix: Float[Array, "l l"]) -> FloatScalar:
-    """Compute the smallest nonzero over the largest |eigenvalue|, after scaling."""
+    """Divide the smallest nonzero |eigenvalue| by the largest one, after scaling."""
     if matrix.shape[0] == 0:
         return jnp.ones((), matrix.dtype)
     values, is_kept = _eigenvalues(matrix)
@@ -219,7 +219,7 @@ def _eigenvalues(matrix: Float[Array, "l l"]) -> tuple[Array, Array]:
 
 
 def _unit_diagonal(matrix: Float[Array, "l l"]) -> tuple[Array, Array]:
-    """Scale rows and columns alike, so that the diagonal entries are one or zero."""
+    """Scale rows and columns so that the diagonal is ±1 or 0; also return `_roots`."""
     root = _roots(matrix)
     return matrix / root[:, None] / root[None, :], root
 

@@ -165,7 +165,7 @@ def _sets(
 def _of_product(
     params: dict[str, Any], first: np.ndarray, second: np.ndarray
 ) -> np.ndarray:
-    """Unite the sets of the factors of each element of a small product."""
+    """For each element of a small product, unite the sets of its factors."""
     result, parts = params["result"], []
     for indices, part in ((params["first"], first), (params["second"], second)):
         summed = [k for k, index in enumerate(indices) if index not in result]
@@ -237,7 +237,7 @@ def _padded(x: np.ndarray, filled: np.ndarray, config: Any) -> np.ndarray:
 def _gathered(
     params: dict[str, Any], x: np.ndarray, index: np.ndarray | None
 ) -> list[np.ndarray] | None:
-    """Rearrange sets like a gather of single elements along one axis."""
+    """Rearrange sets like a gather along one axis; None for all other gathers."""
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     (axis, *others) = numbers.start_index_map
     if index is None or others or numbers.operand_batching_dims:
@@ -248,7 +248,7 @@ def _gathered(
     if numbers.collapsed_slice_dims != (axis,):
         return None
     places = index[..., 0]
-    # An index out of range is clamped, or gives a constant.
+    # An index out of range is clamped, or gives a constant, for which any set is valid.
     picked = np.take(x, np.clip(places, 0, x.shape[axis] - 1), axis=axis)
     first = list(range(axis, axis + places.ndim))
     rest = [k for k in range(picked.ndim - 1) if k not in first]

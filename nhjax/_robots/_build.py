@@ -218,7 +218,7 @@ def _bodies(model: Any, layout: Layout) -> Bodies:
 def fixed_tendons(
     model: Any, space: Space, without: bool
 ) -> tuple[np.ndarray, list[int]]:
-    """Return the lengths of the fixed tendons as rows, and the numbers of the tendons.
+    """Return the lengths of the fixed tendons as rows, and the indices of the tendons.
 
     A row times the scalar coordinates is the length of a tendon.
     """
@@ -236,7 +236,7 @@ def fixed_tendons(
 
 
 def check_kinds(given: Any) -> Mapping[str, Sequence[str]]:
-    """Raise unless `parameters` maps known kinds to sequences of names; return it."""
+    """Return `parameters`; raise unless it maps `KINDS` to sequences of names."""
     if given is None:
         return {}
     if not isinstance(given, Mapping):
@@ -491,7 +491,7 @@ def rolling_options(rolling: Any) -> dict[str, tuple[Any, ...]]:
 
 
 class RollingGeom(NamedTuple):
-    """A geom that rolls: its number, and the directions in which it does not slip.
+    """A geom that rolls: its index, and the directions in which it does not slip.
 
     If `is_parameter`, its radius can be given in `args`.
     """
@@ -716,7 +716,8 @@ def _height_varies(
 ) -> bool:
     """Return whether the joints can change the height of a geom above the ground.
 
-    The positions of the bodies named in `moving` can change too.
+    The positions of the bodies named in `moving` can change too. Raise if the height is
+    constant and not zero.
     """
     if not isinstance(ground, Plane):
         return True
@@ -814,7 +815,7 @@ class _Rows:
         return jnp.concatenate([jnp.zeros(0), *rows])
 
     def _evaluate(self, q: PyTree[Array], args: Args) -> tuple[Array, Array]:
-        """Compute the constraints on positions, and the rates of all constraints."""
+        """Compute constraints on positions, and the rates of all per unit velocity."""
         space = self.space
 
         def rates(v):

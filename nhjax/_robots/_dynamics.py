@@ -48,7 +48,7 @@ class BallSpring(NamedTuple):
 
 
 class Mechanics(NamedTuple):
-    """All numbers of a robot that its functions use.
+    """All numbers of a robot that its Lagrangian and its force use.
 
     Arrays with one entry for each velocity are in MuJoCo's order, which is also the
     order of the velocities of the system. Arrays for tendons have one entry for each
@@ -95,8 +95,8 @@ class Parameters(eqx.Module):
     - `names`: for each of the `KINDS` in use, a dictionary from the names of bodies,
         joints or geoms to their places in the arrays. For positions and radii these are
         places in MuJoCo's model, and are not used here.
-    - `controls`: the names of the actuators, or None if a function of the user computes
-        the controls: `args["controls"]` may then have any structure.
+    - `controls`: the names of the actuators, or None if a function that the user passed
+        computes the controls: `args["controls"]` may then have any structure.
     """
 
     names: dict[str, dict[str, tuple[int, ...]]] = eqx.field(static=True)
@@ -280,7 +280,7 @@ def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
         return energy, [twist for twist, _, _ in motion]
 
     def rest_of(q, v, args, energy):
-        """Add the energies of armatures, springs and tendons."""
+        """Add the terms of armatures, springs and tendons to the Lagrangian."""
         dtype = v.dtype
         if np.any(mechanics.armature) or "armature" in parameters.names:
             armature = parameters.replaced("armature", mechanics.armature, args, dtype)
@@ -526,7 +526,7 @@ def loops_of(
 
 
 def frame_pose(joints: Sequence[Joint], space: Space, frame: Frame) -> Any:
-    """Return the pose (t, q, args) -> position and rotation of one frame."""
+    """Return a function (t, q, args) -> position and rotation of one frame."""
     poses = FramePoses(joints, space, [frame])
 
     def pose(t: FloatScalarLike, q: PyTree[Array], args: Args) -> tuple[Array, Array]:

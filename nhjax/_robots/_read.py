@@ -144,7 +144,7 @@ def _compile_file(
 
 
 def _set_root(robot: ElementTree.Element, path: Path, root: str | None) -> None:
-    """Add the joint between the world and the root link of a URDF file."""
+    """Add the joint, if any, that `root` puts between the world and the root link."""
     links = [link.get("name") for link in robot.findall("link")]
     children = [child.get("link") for child in robot.findall("joint/child")]
     roots = [name for name in links if name not in children]
@@ -285,7 +285,7 @@ def check_supported(
 ) -> dict[str, set[int]]:
     """Raise a `ValueError` for parts that are neither supported nor ignored.
 
-    `rolling` has the numbers of the geoms that roll. Return the numbers of the
+    `rolling` has the indices of the geoms that roll. Return the indices of the
     actuators and of the equalities to leave out.
     """
     if isinstance(ignore, str):
@@ -431,7 +431,7 @@ def is_fixed_tendon(model: Any, tendon: int) -> bool:
 def unsupported_actuators(
     model: Any, without_tendons: bool
 ) -> Iterator[tuple[int, str]]:
-    """Yield the number of each actuator that is not supported, and the reason."""
+    """Yield the index of each actuator that is not supported, and the reason."""
     library = mujoco()
     transmissions, gains = library.mjtTrn, library.mjtGain
     biases, dynamics = library.mjtBias, library.mjtDyn
@@ -512,7 +512,7 @@ def _equalities(model: Any, without_tendons: bool) -> Iterator[tuple[int, str]]:
 
 
 def active_equalities(model: Any) -> list[int]:
-    """Return the numbers of the equalities that act from the start."""
+    """Return the indices of the equalities that act from the start."""
     if has_flag(model, "EQUALITY") or has_flag(model, "CONSTRAINT"):
         return []
     return np.flatnonzero(model.eq_active0).tolist()

@@ -198,7 +198,7 @@ class Robot(eqx.Module):
         return self._layout.space
 
     def _array(self, name: str, given: Any, rest: Array) -> Array:
-        """Convert a dictionary by joints, or check the shape of an array."""
+        """Convert a dictionary to an array, or check an array; default to `rest`."""
         if given is None:
             return rest
         if not isinstance(given, Mapping):

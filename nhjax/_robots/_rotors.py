@@ -19,7 +19,7 @@ from ._joints import Joint, pose_of_joint
 class Rotor(NamedTuple):
     """The part of the kinetic energy that depends on the rate of a rotor.
 
-    - `joint`, `parent`: the numbers of its joint and of the joint before it, or -1.
+    - `joint`, `parent`: the indices of its joint and of the joint before it, or -1.
     - `momentum`, `inertia`: h of shape (6,) for a twist (v, ω), and I.
     """
 
@@ -96,7 +96,7 @@ def merge_rotors(
 
 
 def spatial_inertia(inertia: entries.Matrix) -> entries.Matrix:
-    """Return the matrix M of ½ ξ·M ξ = ½ m v² + v·(ω × m c) + ½ ω·I ω.
+    """Return M of the kinetic energy ½ ξ·M ξ = ½ m v² + v·(ω × m c) + ½ ω·I ω.
 
     The pseudo-inertia gives the mass m, the moment m c and the inertia I about the
     origin.

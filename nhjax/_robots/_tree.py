@@ -38,8 +38,9 @@ class Part(NamedTuple):
     def groups(self) -> tuple[AbstractLieGroup, ...]:
         """The part as Lie groups.
 
-        A free joint has a position in space and a rotation. On SE(3) both would share a
-        chart, so that steps of a body that moves fast would be less accurate.
+        A free joint has two groups, for its position and its rotation. On SE(3) both
+        would share a chart, so that steps of a body that moves fast would be less
+        accurate.
         """
         groups = {"free": (Euclidean(3), SO3()), "ball": (SO3(),)}
         return groups.get(self.kind) or (Euclidean(len(self.joints)),)
@@ -233,7 +234,7 @@ class Tree:
         gravity: Float[np.ndarray, "3"] | None,
         args: Args,
     ) -> list[tuple[entries.Vector, entries.Vector, entries.Entry]]:
-        """Compute the results of `motion` for each node, entry by entry."""
+        """Compute each node's twist and gravity like `motion`, but entry by entry."""
         own = self._relative_scalars(q, args)
         twists = self._own_twists_of_scalars(v, [rotation for rotation, _ in own])
         weight = entries.known(np.zeros(3) if gravity is None else gravity)
@@ -431,7 +432,7 @@ class Tree:
 
 
 def _rows_of(vectors: list[entries.Vector], dtype: Any) -> Array:
-    """Convert vectors to rows of an array. Vectors of Python floats are zero."""
+    """Convert vectors to rows of an array. Vectors of Python floats must be zero."""
     rows = jnp.zeros((len(vectors), 3), dtype)
     for number, vector in enumerate(vectors):
         if not all(isinstance(x, float) for x in vector):

@@ -63,7 +63,7 @@ def uses_first_order_terms(
 
 
 def forces_have_slopes(stages: StageEquations) -> bool:
-    """Return whether the forces in these equations pass `has_force_slopes`."""
+    """Return whether the forces of this step have derivatives in the velocities."""
     at_start = stages.t, stages.q, stages.p, stages.multiplier, stages.args
     return has_force_slopes(stages.system, *at_start)
 
@@ -119,8 +119,8 @@ class FirstOrderTerms(eqx.Module):
     and the equations of the nodes change in the same form. The leading part is N δH_i
     with the mass matrix N at the start of the step. All other terms are of order h: the
     change of the mass matrix from the start to the stage, N_i = N + h c_i Ṅ, the change
-    of momenta with positions, and the change of forces with velocities. Their
-    derivatives are taken at the start of the step and multiplied by N⁻¹, so that with
+    of momenta with positions, and the change of forces with velocities. All derivatives
+    are taken at the start of the step and multiplied by N⁻¹, so that with
     z_i = N⁻¹ r_i
 
     δH_i = z_i - N⁻¹ (the terms, applied to z),
@@ -231,14 +231,15 @@ def first_order_terms(
         node_momentum=h * scaled(body.momentum),
         node_force=h * scaled(chart.body_force),
     )
-    # A derivative can be infinite or NaN, such as the derivative of |v| at rest.
+    # A derivative can be infinite or NaN, such as the derivative of |v| at rest. Then,
+    # or if `force` is larger than `_LARGEST`, all terms become zero.
     is_finite = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(terms)]
     is_usable = jnp.all(jnp.stack(is_finite)) & (_size(terms.force) <= _LARGEST)
     return jax.tree.map(lambda x: jnp.where(is_usable, x, 0), terms)
 
 
 def _size(matrix: Float[Array, "n n"]) -> FloatScalar:
-    """Measure a matrix independently of the units of the coordinates."""
+    """Compute a size of a matrix that does not depend on the units of coordinates."""
     return jnp.sqrt(jnp.sum(jnp.abs(matrix * matrix.T)))
 
 

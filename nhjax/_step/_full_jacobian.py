@@ -34,7 +34,7 @@ from ._equations import (
 
 
 class StageResponses(NamedTuple):
-    """The changes of stages and nodes that a change of the multipliers causes."""
+    """The changes of stages and nodes, divided by h, that reactions cause."""
 
     velocity: Float[Array, "s n"]
     momentum: Float[Array, "s p"]
@@ -106,7 +106,7 @@ class LinearisedStep(eqx.Module):
     conjugate: Slopes | None  # of μ_i, for a Hamiltonian system
     node_inverse: Float[Array, "r n n"]  # the inverse of ∂r_i/∂u_i of the nodes
     end_inverse: Float[Array, "n n"]  # (∂p/∂u)⁻¹ at the end
-    node_gain: Float[Array, "r n n"] | None  # None for the identity on a vector space
+    node_gain: Float[Array, "r n n"] | None  # Ad^*_{τ(y_i)}; None on a vector space
     node_position: Float[Array, "r n n"]  # ∂r_i/∂Ξ_i of the nodes
     node_xi: Float[Array, "r n n"] | None  # ∂r_i/∂ξ of the nodes
 
@@ -169,7 +169,7 @@ class LinearisedStep(eqx.Module):
 def _moves(
     stages: StageEquations, velocity: Float[Array, "s n"]
 ) -> tuple[Array, Array, Array]:
-    """Return the changes of H_i, Ξ_i and ξ."""
+    """Return the changes of H_i, Ξ_i and ξ for given changes of H_i."""
     a, b = stages.coefficients("a"), stages.coefficients("b")[None]
     return (
         velocity,
@@ -638,7 +638,7 @@ def _reactions(
 def end_slopes(
     stages: StageEquations, x: StageUnknowns
 ) -> tuple[tuple[Array, Array], ...]:
-    """Differentiate `end_residual` in the increment ξ and in u at the end."""
+    """Differentiate the equations of motion at the end in ξ and in u at the end."""
     given = _path(stages, x)
 
     def residual(xi, u):

@@ -25,8 +25,8 @@ from .._system import (
 
 
 # An impulse changes an invariant by at most this fraction of Σ |u ∂I/∂u|, added up over
-# both ends of the step. Near rest this sum is small, and there may be no impulse that
-# corrects the error.
+# both ends of the step. Near rest, where there may be no impulse that corrects the
+# error, this limit is small.
 _LARGEST_PART = 0.1
 # With an indefinite mass matrix, ω·M⁻¹ω can vanish although ω does not. If ω·M⁻¹ω is
 # less than this fraction of its bound Σ_ij |M⁻¹_ij| ω_i², a step has no impulse. All
@@ -326,7 +326,10 @@ class InvariantCorrection(eqx.Module):
     def change(
         self, impulse: Float[Array, " k"], error: Float[Array, " k"]
     ) -> Float[Array, " k"]:
-        """Compute the change of ε that solves the linearised equations."""
+        """Compute the change of ε that solves the linearised equations.
+
+        The changed ε is clipped to `limits`.
+        """
         residual = self.errors * error + self.rest * impulse
         wanted = impulse - small_einsum("kl,l->k", self.inverse, residual)
         return jnp.clip(wanted, -self.limits, self.limits) - impulse

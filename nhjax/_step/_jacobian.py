@@ -79,10 +79,10 @@ from ._invariants import InvariantCorrection
 def simplified_newton_update(
     stages: StageEquations, factors: "StageJacobianFactors", x: StageUnknowns
 ) -> tuple[StageUnknowns, Evaluation]:
-    """Compute the next iterate of simplified Newton, and evaluate the equations at x.
+    """Compute the iterate after x, and return it with the evaluated residuals.
 
-    Each residual is evaluated at the newest iterate (Gauss-Seidel). This costs the same
-    as evaluating all of them at x, and converges faster.
+    Each residual is evaluated with the unknowns corrected so far (Gauss-Seidel). This
+    costs the same as evaluating all residuals at x, and converges faster.
     """
     forces = stage_forces(stages, x)
     x_next = factors.correct_stages(stages, x, forces.residual)
@@ -90,10 +90,10 @@ def simplified_newton_update(
     change = x_next.velocity - x.velocity
     x_next = factors.correct_nodes(stages, x_next, r_nodes, change)
     if stages.invariants is not None:
-        # The impulses are corrected before the constraints, so that the constraints are
-        # evaluated after the impulses have changed the unknowns. This order matters if
-        # a system is nearly at rest: the work that the reactions do on the change by
-        # the impulses is then not negligible.
+        # The impulses are corrected first, so that the constraints are evaluated with
+        # the changes by the impulses. In the other order, the multipliers would ignore
+        # these changes, on which the reactions do work. In a system nearly at rest this
+        # work is not negligible.
         error = invariant_errors(stages, x_next)
         x_next = factors.correct_impulses(stages, x_next, error)
     if factors.full is not None:
@@ -103,7 +103,7 @@ def simplified_newton_update(
         kinematic, holonomic = constraint_values(stages, x_next)
         x_next = factors.correct_multipliers(stages, x_next, kinematic, holonomic)
     if stages.end_multiplier_is_unknown:
-        # λ_c depends on v_{k+1} at zeroth order: it must be corrected with the new
+        # λ_c depends on v_{k+1} at zeroth order in h: it must be corrected with the new
         # velocity. Otherwise each of the two errors adds to the other, and an iteration
         # reduces them only by the square root of the usual factor.
         x_next = factors.correct_end(stages, x_next, end_residual(stages, x_next))
@@ -111,10 +111,10 @@ def simplified_newton_update(
 
 
 class MultiplierResponses(NamedTuple):
-    """The changes of stages and nodes for unit changes of the multipliers' unknowns.
+    """The changes of stages and nodes by a unit change of each multiplier unknown.
 
-    The last axis lists these unknowns, h δy of the closure and h δΛ. With the terms of
-    order h the responses are stored, since the Schur complement is formed from them.
+    The last axis lists these unknowns, h δy of the closure and h δΛ. The responses are
+    stored only with the terms of order h, where they give the Schur complement.
     """
 
     velocity: Float[Array, "s n c"]
@@ -144,7 +144,7 @@ class FullFactors(eqx.Module):
     def correct_stages(
         self, stages: StageEquations, x: StageUnknowns, residual: Float[Array, "s n"]
     ) -> StageUnknowns:
-        """Solve the linearised equations of the stages with constant multipliers."""
+        """Correct the stages: solve their linearised equations at fixed multipliers."""
         velocity, momentum = self.step.of_stages(stages, residual)
         moved = replace(x, velocity=x.velocity - velocity)
         if not stages.hamiltonian:
@@ -207,8 +207,8 @@ class FullFactors(eqx.Module):
         h, m = stages.h, stages.num_nonholonomic
         momentum = jnp.zeros_like(r.momentum)[:, :0]
         if r.velocity is not None:
-            # A change of the momenta, with the matrix (∂v/∂μ)⁻¹, cancels the residuals
-            # of the velocities.
+            # A change of the stage momenta μ, computed with the matrix (∂v/∂μ)⁻¹,
+            # cancels the residuals of the velocities.
             assert self.step.conjugate is not None
             matrices = self.step.conjugate.by_velocity
             momentum = -small_einsum("ikn,in->ik", matrices, r.velocity)
@@ -351,8 +351,8 @@ class StageJacobianFactors(eqx.Module):
     the positions, and B_s δu_s = -r for the rate of the holonomic constraints at the
     end of the step. These three conditions give a Schur complement for the unknowns
     h δy of the closure and h δΛ of the holonomic constraints. For small h this matrix
-    is invertible by hypothesis H2 and the compatibility condition. For the symmetric
-    closure, the sign with which its unknown ν enters the last multiplier matters too;
+    is invertible by hypothesis H2 and the compatibility condition. With the symmetric
+    closure, it is invertible only for one sign of the unknown ν in the last multiplier;
     see `docs/closures.md`.
 
     With `first_order`, the terms of order h are added to N⁻¹ r. The changes that
@@ -374,7 +374,7 @@ class StageJacobianFactors(eqx.Module):
     def correct_stages(
         self, stages: StageEquations, x: StageUnknowns, residual: Float[Array, "s n"]
     ) -> StageUnknowns:
-        """Compute u - N⁻¹ r_u for the stages, and their velocities."""
+        """Return x with u - N⁻¹ r_u at the stages, and with the velocities of u."""
         if self.full is not None:
             return self.full.correct_stages(stages, x, residual)
         change = self.momentum_inverse.matvec(residual)
@@ -392,10 +392,11 @@ class StageJacobianFactors(eqx.Module):
         residual: Float[Array, "r n"],
         change: Float[Array, "s n"],
     ) -> StageUnknowns:
-        """Compute the fibre coordinates u - N⁻¹ r_v of the nodes.
+        """Return x with the fibre coordinates u - N⁻¹ r_v at the nodes.
 
         The residual was evaluated at positions that include the `change` of the stage
-        velocities, but with forces that do not include it.
+        velocities, but with forces that do not. The terms of order h, and the full
+        factors, add the effect of this change on the forces.
         """
         if self.full is not None:
             du = self.full.step.of_nodes(stages, residual, change)
@@ -486,7 +487,7 @@ class StageJacobianFactors(eqx.Module):
     def correct_impulses(
         self, stages: StageEquations, x: StageUnknowns, error: Float[Array, " k"]
     ) -> StageUnknowns:
-        """Change ε so that the linearised equations of the invariants hold.
+        """Change impulses ε so that the linearised equations of the invariants hold.
 
         The stages and nodes change with ε, so that their momentum equations, which have
         just been solved, still hold to leading order.
@@ -522,7 +523,7 @@ def factorise_stage_jacobian(
     lin: Linearisation,
     jacobian: JacobianName,
 ) -> StageJacobianFactors:
-    """Factorise the stage Jacobian, with N and K at the start of the step, B_i at x.
+    """Factorise the stage Jacobian, with N, K at the start of the step and B_i at x.
 
     `jacobian` selects the part of the Jacobian, as for `SimplifiedNewton`. With
     `"full"`, all derivatives are taken at x.

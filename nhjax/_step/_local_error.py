@@ -46,12 +46,12 @@ from ._step import StepOutcome, StepState
 
 # The error of a step is the error of the quadrature with the weights b, times `_GROWTH`
 # to the power p + 1 - s. The exponent is the number of orders that the samples do not
-# determine. The factor a is `_GROWTH_BY_COMMUTATOR` times the eigenvalue of ad(h v).
-# Both values were fitted to the errors of steps of the gallery
+# determine. The factor a is `_GROWTH_BY_COMMUTATOR` times the largest eigenvalue of
+# ad(h v). Both values were fitted to the errors of steps of the gallery's systems
 # (`benchmarks.adaptive_steps`).
 _GROWTH, _GROWTH_BY_COMMUTATOR = 2.8, 1.2
-# Velocities in a chart also change because of the chart. Therefore their derivatives
-# are multiplied by this factor, which was fitted to the same errors.
+# A part of the change of velocities in a chart comes from the chart itself. Therefore
+# their derivatives are multiplied by this factor, which was fitted to the same errors.
 _PART_IN_CHART = 0.5
 
 
@@ -109,8 +109,8 @@ def local_error(
                 lambda u: system.velocity(t, start.state.q, u, args), (u,), (change,)
             )
         )(changes)
-    # The mean of the stage velocities is the same for the step back, which has the same
-    # velocities in reverse order.
+    # The mean of the stage velocities gives a step and the step back the same growth:
+    # their stage velocities are the same in reverse order.
     mean = jnp.asarray(method.b, h.dtype) @ outcome.record.velocity
     by_chart = _growth_in_chart(system.manifold_of(start.state.q), h * mean)
     # The derivative of order k + 1 of q is the derivative of order k of the velocity.
@@ -132,7 +132,7 @@ def local_error(
 
 
 def _largest(by_force: Array, by_velocity: Array) -> Float[Array, " s"]:
-    """Return the larger of two estimates of the size of each derivative (a row)."""
+    """Return the size (root mean square) of each row, the larger of two estimates."""
     both = jnp.stack([by_force, by_velocity])
     return jnp.sqrt(jnp.max(jnp.mean(both**2, axis=2), axis=0))
 
@@ -156,8 +156,8 @@ def _growth_in_chart(
     if manifold.is_flat:
         return None
     ad = jax.jacfwd(lambda eta: manifold.ad(xi, eta))(jnp.zeros_like(xi))
-    # For a rotation by the angle a, the eigenvalues of ad are ia, -ia and 0. The trace
-    # of its fourth power is 2 a^4, and does not depend on the basis.
+    # For a rotation by the angle a, the eigenvalues of ad are ia, -ia and 0. The size a
+    # follows from the trace of the fourth power of ad, which is 2 a^4 in every basis.
     square = ad @ ad
     trace = jnp.maximum(jnp.sum(square * square.T), float(jnp.finfo(xi.dtype).tiny))
     return _GROWTH_BY_COMMUTATOR * (0.5 * trace) ** 0.25
@@ -169,20 +169,19 @@ def _extrapolated(
     by_chart: FloatScalar | None,
     known_growth: FloatScalar,
 ) -> tuple[FloatScalar, FloatScalar]:
-    """Estimate the size of a higher derivative from derivatives of orders 1, ..., s.
+    """Estimate the size of the derivative of the given order from U_1, ..., U_s.
 
-    **Returns:** the size, and the growth r from order to order.
+    **Returns:** this size, and the growth r from order to order.
     """
     number = sizes.shape[0]
     # If the first derivative vanishes in the middle of the step, it is about half of
-    # U_2 at the ends.
+    # U_2 at the ends. U_1 is taken at least as large.
     first = jnp.maximum(sizes[0], 0.5 * sizes[1])
     first = jnp.maximum(first, float(jnp.finfo(sizes.dtype).tiny) ** 0.25)
     last = sizes[-1]
     growth = _root(last / first, number - 1)
     if number > 2:
-        # A derivative can vanish, but not together with the derivative of the next
-        # order.
+        # U_s can vanish, but not together with U_{s-1}. Therefore U_{s-1} is used too.
         other = _root(sizes[-2] / first, number - 2)
         growth = jnp.maximum(growth, jnp.minimum(other, known_growth))
         last = jnp.sqrt(last**2 + (growth * sizes[-2]) ** 2)
@@ -246,6 +245,6 @@ def error_factor(method: AbstractMethod) -> float:
     """Return the typical error of a step of order p, divided by U_{p+1}."""
     p = method.order
     defect = abs(float(method.b @ method.c**p) - 1 / (p + 1)) / math.factorial(p)
-    # With some methods the quadrature has a higher order than p.
+    # With some methods the quadrature has a higher order than p, and no defect.
     defect = max(defect, 1e-2 / math.factorial(2 * p))
     return defect * _GROWTH ** (p + 1 - len(np.unique(method.c)))

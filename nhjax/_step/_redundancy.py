@@ -15,19 +15,19 @@ class Redundancy(eqx.Module):
 
     With the Delassus matrix C at the start of the step and its least-norm inverse C⁻,
     P = C C⁻ projects the values of the constraints onto the range of C. The dimension
-    of this range is the number of independent constraints. Near the start of the step
-    P Φ = 0 only where Φ = 0. The remaining equations are replaced by
+    of this range is the number of independent constraints. Near the start of the step,
+    P Φ = 0 implies Φ = 0. The other equations, (1 - P) Φ = 0, are replaced by
 
-    (1 - P) diag(C) h δΛ = 0,
+    (1 - P) diag(C) h Λ = 0,
 
-    so that the multipliers keep the least norm, up to the change of the derivatives
-    within the step.
+    so that the multipliers keep the least norm, up to the change of the constraint
+    derivatives within the step.
 
     P must not mix nonholonomic and holonomic constraints: nonholonomic constraints are
     imposed at the nodes, but holonomic constraints at the stages, where their rates do
     not vanish. Therefore P is block diagonal, with the first and the last diagonal
     block of C C⁻. If a combination of nonholonomic constraints follows from holonomic
-    ones, it is among the remaining equations. At the end of the step both kinds of
+    ones, it is among the replaced equations. At the end of the step both kinds of
     constraints hold, and so do all equations that follow from them.
     """
 

@@ -13,8 +13,9 @@ from .._system import FunctionNoise, Linearisation
 
 # When the increments of the stages stop falling, they can be six times as large as the
 # round-off that the functions of a system cause in them. Increments count as noise up
-# to `NOISE_UNITS` = 400 times a given round-off. The measured round-off is therefore
-# multiplied by `PART`: increments then count as noise up to 50 times its size.
+# to `NOISE_UNITS` = 400 times a given round-off, which is too much here. The measured
+# round-off is therefore multiplied by `PART`: increments up to 50 times the measured
+# round-off then count as noise.
 PART = 1 / 8
 
 

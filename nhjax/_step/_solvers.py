@@ -57,8 +57,8 @@ from ._step import AbstractStageSolver, FrozenNewtonMap
 # If N⁻¹ times the residual is larger than this, relative to the fibre coordinates, the
 # iterate is not a solution.
 _GROSS = 1e-6
-# For systems with more coordinates, or steps with more unknowns, Newton's method calls
-# `jnp.linalg.solve`.
+# For systems with more coordinates, or steps with more unknowns, Newton's method solves
+# its equations by `jnp.linalg.solve`, and not by blocks.
 _MOST_COORDINATES, _MOST_UNKNOWNS = 32, 256
 # After this many iterations of simplified Newton, the fallback to Newton's method takes
 # less time than further iterations. With more than 100, `iterate` would accept a last
@@ -215,7 +215,7 @@ def has_default_jacobian(stage_solver: AbstractStageSolver) -> bool:
 def solvers_of_unsolved_steps(
     stage_solver: AbstractStageSolver,
 ) -> list[SimplifiedNewton]:
-    """List the solvers with which a plain call repeats a run that fails."""
+    """List, in order, the solvers with which a plain call repeats a failed run."""
     is_simplified = isinstance(stage_solver, SimplifiedNewton)
     if not is_simplified or stage_solver.fallback is not None:
         return []
@@ -264,8 +264,8 @@ class Newton(AbstractStageSolver):
             r, push, evaluation = jax.linearize(
                 lambda x: stage_residuals(stages, x), x, has_aux=True
             )
-            # After a change of x by a few units in the last place, the residuals differ
-            # from the prediction of the Jacobian by the round-off of the residuals.
+            # The round-off of the residuals is measured: x is changed by a few units in
+            # the last place, and the Jacobian predicts the change without round-off.
             near_z = z + 8 * eps * uneven_perturbations(z)
             near = stage_residuals(stages, unravel(near_z))[0]
             change = stage_residuals(moved, x)[0]
@@ -407,8 +407,8 @@ class Scale(NamedTuple):
     The fibre coordinates are v, or p for a Hamiltonian system. All fields are in units
     of fibre coordinates. `round_off` and `noise` are values of round-off divided by the
     unit round-off. The round-off of fibre coordinates is about the unit round-off times
-    `size + round_off`. Increments below the unit round-off times `noise` count as the
-    measured round-off of the functions of the system.
+    `size + round_off`. The measured round-off of the functions of the system changes
+    fibre coordinates by about the unit round-off times `noise`.
     """
 
     size: FloatScalar
@@ -424,7 +424,7 @@ def _iterated(
     skip: Array,
     max_iterations: int,
 ) -> Solved[StageUnknowns, Evaluation]:
-    """Repeat the `iteration` of a solver until it ends."""
+    """Repeat the `iteration` of a solver until it converges or fails."""
     return iterate(
         iteration,
         x0,
@@ -443,9 +443,9 @@ def fibre_coordinate_scale(
 ) -> Scale:
     """Estimate the size of the fibre coordinates of a step and their round-off.
 
-    The size is the size of the coordinates at the starting values x0 plus the changes
-    by forces and by reactions over the step, which may cancel each other. For a system
-    at rest only these changes remain.
+    The size is the sum of three sizes: of the coordinates at the starting values x0, of
+    their change over the step, and of the part of this change by reactions, which
+    forces may cancel. For a system at rest only the changes remain.
 
     The additional round-off has these parts:
 
@@ -488,8 +488,7 @@ def fibre_coordinate_scale(
 def _kinematic_scale(
     stages: StageEquations, q: PyTree[Array], x0: StageUnknowns
 ) -> Float[Array, " m"]:
-    """Estimate the change of nonholonomic constraints if each position changes by its
-    own size.
+    """Estimate how nonholonomic constraints change if positions change by their size.
 
     One direction of change is enough for an estimate. Changing each coordinate
     separately would need one derivative per coordinate.

@@ -612,7 +612,7 @@ class ImplicitStep(AbstractImplicitFunction[StepArguments, StepOutcome]):
     ) -> Changes:
         """Compute the changes of the stages x, of the state at the end and the record.
 
-        The `perturbed` part of the arguments changes at `rates`, and the other part is
+        `rates` are the tangents of the `perturbed` part of the arguments. The rest is
         `fixed`. The changes are zero unless the step is `ok`, that is, solved.
         """
 
@@ -639,7 +639,7 @@ class ImplicitStep(AbstractImplicitFunction[StepArguments, StepOutcome]):
 
 
 def tangent_of_outcome(outcome: StepOutcome, changes: Changes) -> StepOutcome:
-    """Return the tangent of an outcome, given the changes of its stages and its end."""
+    """Build the tangent of an outcome: the given changes, and None for other fields."""
     none = jax.tree.map(lambda _: None, outcome)
     return eqx.tree_at(
         lambda outcome: (outcome.stages, outcome.step_state.state, outcome.record),
@@ -665,8 +665,8 @@ def _end(
     p = system.momentum(t, q, u, args)
 
     def continuous():
-        # With the symmetric closure, λ_c is an unknown of the step. But with redundant
-        # constraints, that unknown is not the multiplier of least norm.
+        # With the symmetric closure, λ_c is an unknown of the step. With redundant
+        # constraints it is not used, because it is not the multiplier of least norm.
         if stages.end_multiplier_is_unknown and system.constraints != "redundant":
             return x.end_multiplier
         return linearise(system, t, q, u, args, may_be_sparse=True).multiplier

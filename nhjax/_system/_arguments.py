@@ -349,7 +349,7 @@ def check_same_manifold(
     own: AbstractLieGroup | None,
     of_system: AbstractLieGroup | None,
 ) -> None:
-    """Raise a `ValueError` unless a part has the manifold of its system.
+    """Raise a `ValueError` unless a part and its system have manifolds of one type.
 
     **Arguments:**
 
@@ -368,7 +368,7 @@ def check_same_manifold(
 
 
 def check_coordinates(owner: Any) -> None:
-    """Raise unless the `coordinates` of `owner` are a tuple of names, or None."""
+    """Raise unless `coordinates` of `owner` is None or a tuple of different names."""
     names = owner.coordinates
     if names is None:
         return

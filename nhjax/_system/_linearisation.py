@@ -110,7 +110,8 @@ class Linearisation(eqx.Module):
         """Return which multipliers are unique: all if no constraints are redundant."""
         if not self.is_redundant:
             return jnp.ones(self.violation.shape, bool)
-        # The product C C⁻ projects onto the range of C.
+        # The product C C⁻ projects onto the range of C. A multiplier is unique if its
+        # diagonal entry is one.
         jacobian, reaction, _ = self.dense
         delassus = small_einsum("kn,nl->kl", jacobian, reaction)
         kept = small_einsum("kl,lm->km", delassus, least_norm_inverse(delassus))

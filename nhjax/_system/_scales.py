@@ -37,10 +37,10 @@ def violation_scale(
 ) -> Float[Array, " l"]:
     """Estimate how large the terms of each row of Φ are for vectors as large as u.
 
-    The estimate treats Φ as affine in u. The terms at u itself may be too small: a
-    constraint such as v[1] has a single term, which is round-off in every state that
-    satisfies the constraint. If u is zero, the size of velocities is unknown, and one
-    is used, since terms that cancel have round-off at rest too.
+    The estimate treats Φ as affine in u. The terms at u itself may be too small for a
+    scale: a constraint such as v[1] has a single term, which is round-off in every
+    state that satisfies the constraint. If u is zero, the size of u is taken as one,
+    since terms that cancel have round-off at rest too.
     """
     return velocity_scale(system, lin.jacobian, t, q, u, args)
 
@@ -53,7 +53,7 @@ def velocity_scale(
     u: Float[Array, " n"],
     args: Args,
 ) -> Float[Array, " l"]:
-    """Estimate the sizes of the terms of Φ from its Jacobian ∂Φ/∂u alone."""
+    """Estimate the sizes of the terms of Φ from `jacobian`, ∂Φ/∂u, and Φ at u = 0."""
     affine = _finite_or_zero(system.constraint(t, q, jnp.zeros_like(u), args))
     return jacobian.absolute_row_sums() * nonzero_or_one(max_norm(u)) + affine
 
@@ -63,8 +63,8 @@ def position_scale(
 ) -> Float[Array, " k"]:
     """Estimate how large the terms of each row of Γ are for vectors as large as q.
 
-    The estimate treats Γ as affine in q. The terms at q itself may be too small; see
-    `violation_scale`. If q is zero, its size is taken as one.
+    The estimate treats Γ as affine in q. The terms at q itself may be too small for a
+    scale; see `violation_scale`. If q is zero, its size is taken as one.
     """
     size = nonzero_or_one(max_norm(*jax.tree.leaves(q)))
     sizes = jax.tree.map(lambda x: jnp.full_like(x, size), q)
@@ -139,8 +139,8 @@ def keeps_constraints(
 
 
 def _finite_or_zero(x: Array) -> Array:
-    # A constraint that is singular at zero has no finite value there. This value does
-    # not show how large the terms of the constraint are, so it is replaced by 0.
+    # x are constraints at q = 0 or u = 0. A value that is not finite does not show how
+    # large the terms of the constraint are, so it is replaced by 0.
     return jnp.abs(jnp.nan_to_num(x, nan=0.0, posinf=0.0, neginf=0.0))
 
 
@@ -180,7 +180,7 @@ def function_noise(
 
     The force is measured with a constant multiplier; `dt` is passed on to `noise_near`.
     """
-    # This is a closure, because `args` may contain objects that are not arrays.
+    # `eval_shape` does not get `args`, which may contain objects that are not arrays.
     positions = jax.eval_shape(lambda: system.position_constraint(t, q, args))
     system, args, multiplier = stop_gradient((system, args, multiplier))
 

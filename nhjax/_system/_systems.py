@@ -701,7 +701,7 @@ def with_kept_functions(
     """
     multiplier = None
     if system.force_takes_multipliers:
-        # This is a closure, because `args` may contain objects that are not arrays.
+        # `eval_shape` does not get `args`, which may have objects that are not arrays.
         shape = jax.eval_shape(lambda: system.constraint(t, q, u, args)).shape
         multiplier = jnp.zeros(shape, u.dtype)
     functions = system.functions(t, q, u, multiplier, args)
@@ -741,7 +741,7 @@ def with_frames(system: S, q: PyTree[Array]) -> tuple[S, PyTree[Array]]:
 
 
 class _OfPosition(eqx.Module):
-    """A function of (t, q, ...) that accepts q with frames."""
+    """A function of (t, q, ...) that accepts q with frames, and removes them."""
 
     function: PhaseFunction | PositionFunction | ForceFunction
 

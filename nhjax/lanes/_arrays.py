@@ -50,7 +50,8 @@ def _broadcast_in_dim(
     if not isinstance(value, InMemory) and value.size == 1:
         node = value.reshape(-1)[0]
         if node.op == "const" and node.attr == 0 and not np.signbit(float(node.attr)):
-            # JAX writes a symbolic zero tangent as a broadcast of the constant zero.
+            # JAX writes a symbolic zero tangent as a broadcast of the constant zero. It
+            # becomes a structural zero, whose products are zero.
             node = builder.graph.zero(node.dtype)
         return builder.full(shape, node)
     if isinstance(value, InMemory) and math.prod(shape) == value.size:
@@ -214,7 +215,7 @@ _FAR = 2**62
 
 
 def as_index(builder: Builder, node: Node) -> Node:
-    """Convert an index to int64."""
+    """Convert an index to int64, limiting uint64 so that it does not overflow."""
     if node.dtype == "uint64":
         far = builder.graph.constant(_FAR, "uint64")
         node = builder.graph.op("min", node, far)
@@ -301,7 +302,7 @@ def _write_row(builder: Builder, equation: Any, values: list[ArrayValue]) -> Arr
 def _updated(
     builder: Builder, value: ArrayValue, update: ArrayValue, starts: list[ArrayValue]
 ) -> ArrayValue:
-    """Write an array into another one, at the given start on each axis."""
+    """Return `value` with `update` written into it, at the given start on each axis."""
     if update.size == 0:
         return value
     places = _starts(builder, value.shape, update.shape, starts)
@@ -476,7 +477,7 @@ def _scatter(
 def _combined(
     builder: Builder, equation: Any, op: str | None, old: Node, new: Node
 ) -> Node:
-    """Combine a number of the array with its update."""
+    """Return the number that replaces `old`, given its update `new`."""
     if op is not None:
         return builder.graph.op(op, old, new)
     # `x.at[index].apply(function)` is a scatter that combines numbers by a program.
@@ -541,7 +542,7 @@ def _extreme(dtype: str, sign: int) -> Any:
     return np.iinfo(dtype).max if sign > 0 else np.iinfo(dtype).min
 
 
-# The operation, and the result for an empty array.
+# The operation of each reduction, and its result for an empty array of a dtype.
 _REDUCTIONS = {
     "reduce_sum": ("add", lambda dtype: 0),
     "reduce_prod": ("mul", lambda dtype: 1),

@@ -78,7 +78,7 @@ batching.primitive_batchers[kernel] = _vmap_of_kernel
 
 
 def _vmap_of_batched_call(operands, axes, *, program, is_batched, options):
-    """Flatten the new and the existing axis of members to one axis."""
+    """Batch a batched call again, with both axes of members flattened to one."""
     pairs = list(zip(operands, axes, strict=True))
     size = next(x.shape[axis] for x, axis in pairs if axis is not None)
     member_shapes = [aval.shape for aval in program.in_avals]

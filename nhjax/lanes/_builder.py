@@ -192,7 +192,7 @@ class Memory:
     def rearranged(
         self, value: ArrayValue, move: Callable[[np.ndarray], np.ndarray]
     ) -> ArrayValue:
-        """Apply a function that rearranges NumPy arrays, and returns a view."""
+        """Apply `move`, which rearranges a NumPy array and returns a view of it."""
         if not isinstance(value, InMemory):
             return move(value)
         view = move(flat_indices(value.shape))
@@ -279,7 +279,7 @@ def constant(graph: Graph, values: np.ndarray) -> Buffer:
 
 
 def _split(index: Node | None, offset: int) -> tuple[Node | None, int]:
-    """Move the constant part of an index to the offset."""
+    """Move the constant part of an index to the offset, and return both."""
     while index is not None:
         if index.is_constant:
             return None, offset + int(index.attr)
@@ -385,7 +385,10 @@ class Builder:
         return outs
 
     def run_body(self, body: Any, args: Sequence[ArrayValue]) -> list[ArrayValue]:
-        """Compute the results of the closed jaxpr of the body of a loop."""
+        """Compute the results of the body of a loop, a closed jaxpr.
+
+        A body without `has_iteration` has the programs that it calls written out.
+        """
         outer = self.is_written_out
         self.is_written_out = outer or not has_iteration(body.jaxpr)
         out = self.run(body.jaxpr, body.consts, args)
@@ -411,7 +414,7 @@ class Builder:
         return list(outs) if equation.primitive.multiple_results else [outs]
 
     def last_uses(self, jaxpr: Any) -> list[list[Any]]:
-        """List for each equation the variables that no later equation uses."""
+        """List for each equation the variables whose last use it is."""
         known = self._last_uses.get(id(jaxpr))
         if known is not None:
             return known[1]

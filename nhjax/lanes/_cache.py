@@ -179,7 +179,7 @@ _SOURCES = _hash_of_sources()
 
 @lru_cache(maxsize=1)
 def _environment() -> tuple[str, ...]:
-    """Return everything that code depends on besides its program."""
+    """Return everything that code depends on besides its program and its options."""
     return _SOURCES, *host(), version(), jax.__version__, np.__version__
 
 
@@ -200,7 +200,7 @@ class _Encoder:
     """
 
     def __init__(self):
-        # The objects are stored too, so that no other objects get the same identities.
+        # The objects are stored too, so that no other objects get the same ids.
         self._jaxprs: dict[int, tuple[Any, str]] = {}
         self._avals: dict[int, tuple[Any, Any]] = {}
 
@@ -267,7 +267,7 @@ class _Encoder:
         return [(self.value(key), self.value(mapping[key])) for key in keys]
 
     def value(self, value: Any) -> Any:
-        """Encode a parameter or a constant."""
+        """Encode a parameter or a constant, or raise `_Unknown`."""
         kind = type(value)
         if kind in _PLAIN:
             return value

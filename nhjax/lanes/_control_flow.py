@@ -73,7 +73,7 @@ def _call(
 def _function_call(
     builder: Builder, equation: Any, values: list[ArrayValue]
 ) -> list[ArrayValue]:
-    """Call a program that is compiled once, or write it out."""
+    """Call a program as a function that is compiled once, or write it out."""
     if builder.is_written_out or any(isinstance(x, InMemory) for x in values):
         return _call(builder, equation, values)
     numbers = [node for value in values for node in value.reshape(-1)]  # pyright: ignore
@@ -209,7 +209,7 @@ def _write(builder: Builder, target: Any, value: ArrayValue) -> list:
 
 
 def _shared(one: ArrayValue, other: ArrayValue) -> ArrayValue | None:
-    """Return the result of both sides, if both return the same array."""
+    """Return the result of both sides if it is the same array, and None otherwise."""
     if isinstance(one, InMemory) and isinstance(other, InMemory):
         return one if one.buffer is other.buffer else None
     if isinstance(one, InMemory) or isinstance(other, InMemory):
@@ -233,7 +233,7 @@ def _taken(nodes: Any, aval: Any) -> np.ndarray:
 def _loop_start(
     builder: Builder, equation: Any, values: list[ArrayValue]
 ) -> list[ArrayValue]:
-    """Remember the constants with which the numbers of a carry started."""
+    """Remember the constants with which a carry started in an earlier loop."""
     del equation
     carry, firsts = values[: len(values) // 2], values[len(values) // 2 :]
     for value, first in zip(carry, firsts, strict=True):

@@ -94,7 +94,7 @@ def _write(op: str, arguments: list[Value]) -> tuple[Value, ...]:
 
 
 def _call(op: str, results: int, *arguments: Value) -> tuple[Value, ...]:
-    """Call another function of the library, for float64."""
+    """Write a call of another elementary function, for float64."""
     writer = arguments[0].writer
     writer.wanted[op, "float64", writer.width] = None
     name = symbol(op, "float64", writer.width)
@@ -172,8 +172,9 @@ def rem(x: Value, y: Value) -> Value:
         rest = (a - high) - low
         rest = where(rest < 0.0, rest + b, rest)
     rest = where(a < b, a, rest)
-    # `two_product` may overflow for very large numbers. It may underflow for very small
-    # numbers, if the processor replaces subnormal numbers by 0.
+    # Long division is used for large quotients, and also for very large and very small
+    # numbers. For these `two_product` may overflow, or may underflow if the processor
+    # replaces subnormal numbers by 0.
     is_long = (ratio > _LARGEST_QUOTIENT) | (a > 2.0**1000) | (b < 2.0**-900)
     is_long = is_long & (a < math.inf) & (b > 0.0) & (a >= b)
 

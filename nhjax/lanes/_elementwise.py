@@ -30,7 +30,7 @@ def _each(
 def _each_op(
     op: str, builder: Builder, equation: Any, values: list[ArrayValue]
 ) -> ArrayValue:
-    """Apply an operation of the graph that does not depend on the equation."""
+    """Apply an operation that needs no parameters of the equation to each number."""
     aval = equation.outvars[0].aval
     function = partial(builder.graph.op, op)
     return builder.map_numbers(aval.shape, dtype_name(aval.dtype), function, *values)
@@ -87,7 +87,7 @@ def _round(builder: Builder, equation: Any, x: Node) -> Node:
 
 
 def _in_total_order(op: str) -> Callable[..., Node]:
-    """Compare floats in total order: -NaN < -inf < ... < -0.0 < 0.0 < ... < NaN."""
+    """Return a comparison in the order -NaN < -inf < ... < -0.0 < 0.0 < ... < NaN."""
 
     def function(builder: Builder, equation: Any, *numbers: Node) -> Node:
         keys = [_sorting_key(builder, number) for number in numbers]

@@ -102,7 +102,7 @@ def _members(width: int) -> list[str]:
 
 
 def _module(writer: Writer, size: int) -> str:
-    """Write the module: the function of the members, and the kernel that calls it."""
+    """Write the module: the function `member`, and the kernel that calls it."""
     size = max(size, _ALIGNMENT)
     call = (
         "call void @member(ptr %operands, ptr %results, i64 %first, i64 %last, "
@@ -331,7 +331,7 @@ def _define(writer: Writer, node: Node, name: str) -> None:
 
 
 class _Functions:
-    """The functions that a kernel calls, for vectors and for numbers."""
+    """The functions that a kernel calls, with vectors or with single numbers."""
 
     def __init__(self, live: LiveNodes):
         # For each function, its results that are used, with their places in the struct
@@ -655,7 +655,7 @@ class _LoopResults:
             index = result.attr[1]
             slot = memory.slot(result.dtype)
             if is_partial:
-                # Members that do not enter the loop need an arbitrary value.
+                # Members that do not enter the loop get an arbitrary value.
                 self._write(result, self._in_memory(loop.inits[index]), slot)
             self.slots.append((result, loop.params[index], slot))
 
@@ -774,7 +774,7 @@ class _Memory:
     def _address(
         self, buffer: Buffer, index: Node | None, offset: int
     ) -> tuple[str, bool]:
-        """Write the address of a number; return whether it differs between members."""
+        """Write the address of a number; return it and whether it differs by member."""
         writer, kind = self.writer, memory_type(buffer.dtype)
         pointer = self._bases[buffer]
         if buffer.kind == "scratch" and buffer.is_divergent:

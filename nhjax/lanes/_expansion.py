@@ -52,8 +52,8 @@ class _Expander:
 
     def __init__(self, stays: Container[str]):
         self._stays = stays
-        # The original program is stored too, so that no other object gets the same
-        # identity.
+        # Programs are found by their `id`. The original program is stored too: if it
+        # were freed, another object could get its `id`.
         self._known: dict[int, tuple[Any, Any]] = {}
 
     def program(self, program: Any) -> Any:
@@ -128,7 +128,7 @@ def is_foreign(primitive: Any) -> bool:
 
 
 def _expansion(function: Callable[..., Any], equation: Any) -> Any:
-    """Return the program of `function(*operands, **params)`, or `None`."""
+    """Trace `function(*operands, **params)`; return `None` if this fails."""
     params = equation.params
     if any(map(_holds_programs, params.values())):
         return _traced(partial(function, **params), equation)
@@ -145,7 +145,7 @@ def _known_program(
 
 
 def _traced(function: Callable[..., Any], equation: Any) -> Any:
-    """Return the program of an operation, or `None` if it cannot be traced."""
+    """Trace `function` on the operands of an operation; return `None` if this fails."""
     return _program(function, *_kinds(equation))
 
 
@@ -167,7 +167,7 @@ def _program(function: Callable[..., Any], operands: Any, results: Any) -> Any:
         program = jax.make_jaxpr(function)(*args)
     except Exception:
         # The code of another library may need concrete values, or call code that JAX
-        # cannot trace. The factorisations of this file need at least one row.
+        # cannot trace. The factorisations of this file fail for matrices without rows.
         return None
     found = tuple((x.shape, x.dtype) for x in program.out_avals)
     return program if found == results else None
@@ -201,7 +201,7 @@ def _for_each(function: Callable[..., Any], rank: int) -> Callable[..., Any]:
 
 
 def _is_small_matrix(equation: Any) -> bool:
-    """Return whether the first operand is a few matrices with few rows and columns."""
+    """Return whether the first operand consists of a few small real matrices."""
     shape = equation.invars[0].aval.shape
     is_real = jnp.issubdtype(equation.invars[0].aval.dtype, jnp.floating)
     is_small = len(shape) >= 2 and max(shape[-2:]) <= MOST_ROWS
@@ -213,7 +213,7 @@ def _is_symmetric_problem(equation: Any) -> bool:
 
 
 def _has_only_singular_values(equation: Any) -> bool:
-    """Return whether an operation computes singular values without vectors."""
+    """Return whether an operation computes only singular values of small matrices."""
     params, shape = equation.params, equation.invars[0].aval.shape
     return (
         _is_small_matrix(equation)
@@ -378,7 +378,7 @@ def _singular_values(a: Any, **_: Any) -> list[Any]:
 
     def goes_on(carry: Any) -> Any:
         number, _, cosines = carry
-        # Because of rounding errors, the cosines do not become exactly zero.
+        # Rounding errors keep the cosines above zero, so a small bound ends the sweeps.
         return (number < _MOST_SWEEPS) & (cosines > width * eps)
 
     start = jnp.int32(0), rows, jnp.ones_like(largest)
@@ -402,7 +402,7 @@ def _permutation(pivots: Any, *, permutation_size: int, **_: Any) -> Any:
 
 
 def _sort(*operands: Any, dimension: int, is_stable: bool, num_keys: int) -> list[Any]:
-    """Sort numbers, and other operands in the same order.
+    """Sort the first operand, and reorder the other operands in the same way.
 
     Each number is moved to its rank, which is the number of elements that come before
     it. NaN comes last.
@@ -534,7 +534,7 @@ def _while_any(
 
 
 def _platform_index(*, platforms: Any) -> Any:
-    """Return the number of the branch for the CPU, or of the default branch."""
+    """Return the index of the branch for the CPU, or of the default branch."""
     return jnp.int32(
         next(k for k, names in enumerate(platforms) if names is None or "cpu" in names)
     )
@@ -545,7 +545,7 @@ def _is_real(equation: Any) -> bool:
 
 
 _EXPANSIONS: dict[str, tuple[Callable[[Any], bool], Callable[..., Any]]] = {
-    # Operations of JAX from 0.12 on, which earlier releases wrote as arithmetic.
+    # The next three are operations since JAX 0.12; before, they were arithmetic.
     "log2": (_is_real, _log2),
     "one_minus_square": (_is_real, _one_minus_square),
     "polynomial": (_is_real, _polynomial),

@@ -275,7 +275,7 @@ def _long_log(x: Value) -> DoubleDouble:
         left = (z - 3.0 * c) * _THIRD
         high, low = fast_two_sum(a, a * c)
     more = a * (left + z * z * polynomial(z, LOG_LONG))
-    # The difference of artanh(s) and artanh(a) is the artanh of one small argument.
+    # artanh(s) - artanh(a) is artanh((s - a) / (1 - s a)), nearly its small argument.
     more = low + (more + rest / (d - d * (a * ratio)))
     total, lost = fast_two_sum(k * LN2_HIGH, high * 2.0)
     low = lost + (k * LN2_LOW + more * 2.0)
@@ -299,7 +299,7 @@ def pow(x: Value, y: Value) -> Value:
     high = where(is_zero, -math.inf, where(is_finite, high, size))
     low = where(is_finite & (size > 0.0), low, 0.0)
     power, y1 = y * high, leading_bits(y, 26)
-    # Overflowing results and NaN have no low part.
+    # If the result overflows, underflows or is NaN, y log|x| needs no low part.
     is_moderate = absolute(power) < 750.0
     power = where(is_moderate, y1 * high, power)
     rest = where(is_moderate, (y - y1) * high + y * low, 0.0)

@@ -115,7 +115,7 @@ def field(pointer: str, struct: str, *path: str) -> str:
     return f"getelementptr inbounds %{struct}, ptr {pointer}, {', '.join(indices)}"
 
 
-# The names of the constant strings in the module that contain the error messages.
+# The names, in the module, of the constant strings with the error messages.
 NO_MEMORY, MISMATCH = "nhjax.no_memory", "nhjax.mismatch"
 NO_SCRATCH = "nhjax.no_scratch"
 

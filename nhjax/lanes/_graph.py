@@ -29,7 +29,7 @@ import numpy as np
 
 
 class Unsupported(Exception):
-    """A program cannot be compiled here; the message says why."""
+    """This compiler cannot compile a program; the message says why."""
 
 
 DTYPES = frozenset(
@@ -41,9 +41,7 @@ DTYPES = frozenset(
 
 @cache
 def dtype_name(dtype: Any) -> str:
-    """Return the name of a dtype; raise `Unsupported` for dtypes that kernels do not
-    have.
-    """
+    """Return the name of a dtype; raise `Unsupported` if kernels do not have it."""
     name = getattr(dtype, "name", None) or str(dtype)
     if name not in DTYPES:
         raise Unsupported(f"arrays of {name}")
@@ -63,8 +61,8 @@ class Region:
     def __init__(self, parent: "Region | None", owner: "Node | None", is_side: bool):
         self.parent, self.owner = parent, owner
         self.depth = 0 if parent is None else parent.depth + 1
-        # The innermost side of a branch around this region, or the root. Only sides of
-        # branches and the root have tables of pure nodes.
+        # The innermost side of a branch around this region, or else the root or the
+        # function. Only these regions have tables of pure nodes.
         self.floor = self if is_side or parent is None else parent.floor
         self.table: dict[Any, Node] = {}
         self.loads: dict[Any, Node] = {}
@@ -188,7 +186,7 @@ class Graph:
         return self.constant(0, dtype, is_structural=True)
 
     def folded(self, op: str, nodes: Iterable[Node]) -> Node | None:
-        """Combine nodes one after the other; return `None` if there are none."""
+        """Combine nodes by `op`, one after the other; return `None` for no nodes."""
         total = None
         for node in nodes:
             total = node if total is None else self.op(op, total, node)
@@ -243,7 +241,7 @@ class Graph:
         return Node(op, args, dtype, self.region, self.next_number(), attr)
 
     def op(self, op: str, *args: Node, dtype: str | None = None) -> Node:
-        """Create an elementwise operation, simplified.
+        """Return the node of an elementwise operation, simplified if possible.
 
         The result has the dtype of the last argument unless `dtype` is given.
         """
@@ -286,9 +284,7 @@ COMMUTATIVE = frozenset(("add", "mul", "max", "min", "and", "or", "xor", "eq", "
 
 
 def converted(value: Any, dtype: str) -> Any:
-    """Convert a NumPy number as XLA does: to integers, floats are truncated and
-    clamped.
-    """
+    """Convert a NumPy number as XLA does: truncate and clamp floats to integers."""
     kind = np.dtype(dtype).kind
     if kind in "iu" and value.dtype.kind == "f":
         if np.isnan(value):
@@ -304,7 +300,7 @@ def converted(value: Any, dtype: str) -> Any:
 class Buffer:
     """A piece of memory that a kernel reads or writes.
 
-    The kind is "operand", "result", "constant" or "scratch". Operands and constants are
+    `kind` is "operand", "result", "constant" or "scratch". Operands and constants are
     only read, results are only written, scratch memory is read and written. `is_fixed`
     means that no more stores follow.
     """
@@ -388,14 +384,14 @@ _FOLDS: dict[str, Callable[..., Any]] = {
 _Rule = Callable[..., Node | None]
 
 
-# The kinds of nodes whose value is known, and the kinds of arguments that the rules for
-# sums and products can simplify. Most nodes are of other kinds.
+# The `op` of nodes whose value is known, and of arguments that the rules for sums and
+# products can simplify. Most nodes have another `op`, so that it is tested first.
 _KNOWN = frozenset(("const", "zero"))
 _SPECIAL = frozenset((*_KNOWN, "neg"))
 
 
 def _folded(graph: Graph, op: str, args: Sequence[Node]) -> Node | None:
-    """Return the constant that an operation on constants gives, or `None`."""
+    """Return the constant result of an operation, or `None` if it is not known."""
     fold = _FOLDS.get(op)
     if fold is None:
         return None
@@ -469,7 +465,7 @@ def _div(graph: Graph, a: Node, b: Node) -> Node | None:
     if a.op == "zero" and b.op != "zero":
         return a
     if b.op == "const" and not a.is_constant and np.isfinite(b.attr):
-        # The product with the reciprocal of a power of two is exact.
+        # For a power of two, the product with its reciprocal is exactly the quotient.
         exponent = np.frexp(b.attr)[1]
         if abs(np.frexp(b.attr)[0]) == 0.5 and abs(exponent) < 120:
             return graph.op("mul", a, graph.constant(1 / b.attr, b.dtype))
@@ -603,9 +599,7 @@ class LoopBuilder:
         self.node.number = self.graph.next_number()
 
     def parameter(self, init: Node) -> Node:
-        """Create a number that starts as `init` and changes from iteration to
-        iteration.
-        """
+        """Create a number that starts as `init` and may change in each iteration."""
         info = self.info
         place = (self.node, len(info.params))
         node = self.graph.statement("param", (), init.dtype, place)
@@ -623,7 +617,7 @@ class LoopBuilder:
         self.info.outs = list(outs)
 
     def results(self) -> list[Node]:
-        """Create the last values of the parameters, after the loop."""
+        """Return the nodes of the parameters' values after the loop."""
         info, out = self.info, []
         for index, (param, init, after) in enumerate(
             zip(info.params, info.inits, info.outs, strict=True)
@@ -816,7 +810,7 @@ def needed(outs: Sequence[Node]) -> list[Node]:
 def parameters_for(
     graph: Graph, region: Region, values: Sequence[np.ndarray]
 ) -> tuple[list[np.ndarray], list[Node]]:
-    """Replace numbers that are not constant by parameters; return both."""
+    """Replace non-constant numbers by parameters; return arrays and parameters."""
     arrays, parameters = [], []
     for value in values:
         array = np.empty(value.size, object)

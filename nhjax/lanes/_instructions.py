@@ -21,8 +21,8 @@ from ._writer import (
 )
 
 
-# The arguments: the writer, the node, the width of its result, and its operands as
-# text.
+# The arguments of a rule: the writer, the node, the width of its result, and its
+# operands as text.
 _Rule = Callable[[Writer, Node, int, list[str]], str]
 
 _FLOAT_COMPARISONS = {
@@ -80,9 +80,10 @@ def _div(writer: Writer, node: Node, width: int, args: list[str]) -> str:
 
 
 def _integer_division(writer: Writer, node: Node, width: int, args: list[str]) -> str:
-    """Divide integers with the results of XLA, also where LLVM's division may trap.
+    """Compute the quotient or remainder of integers with the same results as XLA.
 
-    LLVM may trap for the divisor 0, and for -1 if the quotient overflows.
+    LLVM's own instructions may trap for the divisor 0, and for -1 if the quotient
+    overflows.
     """
     a, b = args
     divisor, signed = node.args[1], is_signed(node.dtype)

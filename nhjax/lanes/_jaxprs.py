@@ -174,7 +174,7 @@ def num_results(program: Any) -> int:
 
 
 # Repeated operations are removed only if they are in this set. They have no state
-# (unlike random numbers), and no parameters that a user chooses.
+# (unlike random numbers), and call no Python function.
 _REPEATABLE = frozenset(
     (
         *ARITHMETIC_AND_SHAPES,
@@ -187,7 +187,7 @@ _REPEATABLE = frozenset(
 )
 # The operations whose inner programs are simplified, and the parameters that hold these
 # programs. The inner programs of other operations are not simplified, because the rules
-# of these operations rely on them.
+# of these operations may rely on the original programs.
 _INNER = {
     BATCHED_CALL: ("program",),
     "checkpoint": ("jaxpr",),
@@ -217,8 +217,8 @@ class _Simplifier:
     """
 
     def __init__(self):
-        # The original program is stored too, so that no other object gets the same
-        # identity.
+        # Programs are found by their `id`. The original program is stored too: if it
+        # were freed, another object could get its `id`.
         self._known: dict[int, tuple[Any, Any]] = {}
 
     def __call__(self, program: Any) -> Any:
@@ -276,7 +276,7 @@ def variables(operands: Any) -> list[Any]:
 
 
 def _is_repeatable(equation: Any) -> bool:
-    # A result that is dropped has no name, so that no other operation can use it.
+    # A dropped result has no name, so it cannot replace that of a repeated operation.
     return equation.primitive.name in _REPEATABLE and not any(
         isinstance(variable, jax.extend.core.DropVar) for variable in equation.outvars
     )

@@ -34,7 +34,7 @@ class CompileOptions(NamedTuple):
     - `xla_below`: if XLA compiles the surrounding program, it also compiles programs
         with fewer operations than this, because a call of native code would take longer
         than these few operations.
-    - `note`: text that the function `engines` adds to the reason.
+    - `note`: text that `nhjax.engines` adds to the reason for the choice of the engine.
     """
 
     is_brief: bool = False
@@ -83,8 +83,8 @@ kernel.is_high = never_high
 @kernel.def_impl
 def _run(*operands, program, options):
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
-        # The kernel was traced before JIT was disabled. `jax.jit` would now only call
-        # this rule again.
+        # The kernel was traced before JIT was disabled. `jax.jit` would now call this
+        # rule again, without end.
         return jax.extend.core.jaxpr_as_fun(program)(*operands)
     run = partial(kernel.bind, program=program, options=options)
     return jax.jit(run)(*operands)

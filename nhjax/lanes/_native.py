@@ -87,7 +87,7 @@ def host() -> Target:
 
 @lru_cache(maxsize=1)
 def version() -> str:
-    """Return the versions of llvmlite and LLVM, which the code depends on."""
+    """Return the versions of llvmlite and LLVM, on which the native code depends."""
     import llvmlite
 
     return f"{llvmlite.__version__} {_llvm().llvm_version_info}"

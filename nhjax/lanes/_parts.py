@@ -49,7 +49,7 @@ def parts(equations: list[Any]) -> Parts:
             needed = _needed(index, equations, maker)
             size = sum(_count(equations[i]) for i in needed)
             has_loop = any(_has_loop(equations[i]) for i in needed)
-            # The order of effects does not change.
+            # Effects that follow a late effect are late too, to keep their order.
             is_late |= has_loop or 4 * size > total
             is_late |= has_effects and bool(equation.effects)
             has_effects |= is_late and bool(equation.effects)
@@ -146,7 +146,7 @@ def _count(equation: Any) -> int:
 
 
 def python_calls(equation: Any) -> set[str]:
-    """Name the operations in an equation that are callbacks or have effects."""
+    """Return the names of callbacks, and of operations with effects, in an equation."""
     name = equation.primitive.name
     if name in _CALLBACKS:
         return {name}

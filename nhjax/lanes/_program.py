@@ -259,7 +259,7 @@ _lock = threading.RLock()
 
 
 def _after_fork() -> None:
-    # The counted threads run in the parent process, not in this child process.
+    # The counted threads run in the parent process, so the child's counter is reset.
     _workers.value = 0
     _lock.release()
 
@@ -325,7 +325,7 @@ def _registered(
 ) -> Entry:
     """Compile and register a kernel, unless this has been done.
 
-    The result has no code if the kernel was already registered.
+    The code of the returned entry is empty if the kernel was already registered.
     """
     handler = handler_ir(num_operands, num_results, width, is_batched)
     name = _name(kernel_ir, handler, "quick" if quick else "optimised")

@@ -179,7 +179,7 @@ def _first_if_none(axis: int | None) -> int:
 
 
 def _shared(axis: int | None, out: Any) -> Any:
-    """Return the result of the first member, if all members share it."""
+    """Return the first member's result if `axis` is `None`, otherwise all of `out`."""
     return jax.tree.map(lambda x: x[0], out) if axis is None else out
 
 
@@ -230,8 +230,7 @@ def _check_hashable(fun: Callable[..., Any], tree: Any) -> None:
 def _name(fun: Callable[..., Any], path: tuple[Any, ...]) -> str:
     """Return the name of an argument in the signature of a function.
 
-    `path` is the path to the argument in a pair: the positional arguments, and the
-    keyword arguments.
+    `path` is the path to the argument in the pair (args, kwargs).
     """
     is_keyword, place = path[0].idx, path[1]
     if is_keyword:

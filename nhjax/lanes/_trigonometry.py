@@ -67,7 +67,7 @@ def _window(exponent: Value) -> list[Value]:
 
 
 def _reduction_of_large() -> str:
-    """Return the definition of a function of x that returns n and r as a double-double.
+    """Return the definition of a function of x that returns n and the double-double r.
 
     x equals n pi / 2 + r up to a multiple of 2 pi.
     """
@@ -165,7 +165,7 @@ def sine_and_cosine(x: Value) -> tuple[Value, Value]:
     is_odd = (n & 1).equals(1)
     sine = where(is_odd, c, s).bits() ^ ((n & 2) << 62)
     cosine = where(is_odd, s, c).bits() ^ (((n + 1) & 2) << 62)
-    # The reduction loses the sign of -0.0.
+    # The reduction loses the sign of -0.0, so the sine of a zero is the zero itself.
     return where(x.equals(0.0), x, sine.number()), cosine.number()
 
 

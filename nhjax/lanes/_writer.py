@@ -366,9 +366,7 @@ class Value:
         return self._compare("oeq", "eq", other)
 
     def cast(self, instruction: str, kind: str) -> "Value":
-        """Convert by an instruction: `zext`, `trunc`, `bitcast`, `uitofp`, `fpext`,
-        `fptrunc`.
-        """
+        """Convert by an LLVM instruction, such as `zext`, `trunc` or `bitcast`."""
         types = f"{self.typed()} to {self.writer.type(kind)}"
         return self.writer.compute(kind, f"{instruction} {types}")
 
@@ -477,7 +475,7 @@ def times_power_of_two(x: Value, exponent: Value) -> Value:
 
 
 def power_of_two(exponent: Value) -> Value:
-    """Return 2^n for n from -1022 to 1023, in the lowest 12 bits of an integer."""
+    """Return 2^n, where the lowest 12 bits of `exponent` are n from -1022 to 1023."""
     return ((exponent << 52) + ONE_BITS).number()
 
 

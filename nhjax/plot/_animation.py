@@ -214,7 +214,7 @@ def _frame_times(times: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def _at(shown: np.ndarray, times: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    # `numpy.interp` needs increasing abscissas.
+    # `numpy.interp` needs increasing times: the signs of decreasing times are changed.
     forwards = 1 if times[-1] > times[0] else -1
     columns = positions.reshape(len(times), -1).T
     values = [np.interp(forwards * shown, forwards * times, x) for x in columns]

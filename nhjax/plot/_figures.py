@@ -124,7 +124,7 @@ def _indices(coordinates: Any, n: int, known: tuple[str, ...]) -> list[int]:
 
 
 def _set_box(ax: Any, ground: float | None) -> None:
-    """Give the box the proportions of the data, with a ratio of at most 2 : 1."""
+    """Include the ground, and give the box the data's proportions, at most 2 : 1."""
     if ground is not None:
         low, high = ax.get_zlim()
         ax.set_zlim(min(low, ground), max(high, ground))

@@ -13,7 +13,7 @@ from .._manifold import AbstractRetraction, Cayley, Exponential
 RETRACTIONS: Mapping[str, AbstractRetraction] = MappingProxyType(
     {"cayley": Cayley(), "exponential": Exponential()}
 )
-# The arguments of the quick form of each study.
+# The arguments of each study with `nhjax run --quick`.
 QUICK: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
         "particle-order": {"stages": (2, 3), "dt": (0.25, 0.125)},

@@ -213,7 +213,7 @@ class BallInvariants(AbstractStudyResult):
         labels = [*LINEAR_INTEGRALS.values(), MOVING_ENERGY]
         for i, (ax, label) in enumerate(zip(axes, labels, strict=True)):
             # The errors of the moving energy differ by orders of magnitude between step
-            # sizes.
+            # sizes, so that they need a logarithmic axis.
             logarithmic = label == MOVING_ENERGY
             # Draw the largest step first, so that it does not hide the others.
             for k, run in enumerate(self.of_stages(s)):
@@ -324,7 +324,7 @@ def _runs(
             dt=h,
             num_steps=num_steps,
             saveat=SaveAt(t0=True, steps=True, fn=observe),
-            # The ball turns by up to half a radian per step.
+            # Newton's method is used: the ball turns by up to half a radian per step.
             stage_solver=Newton(),
             throw=False,
             progress_meter=meter(progress, f"s = {method.stages}"),

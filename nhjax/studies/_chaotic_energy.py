@@ -295,7 +295,7 @@ class _Case(NamedTuple):
 def _program(
     case: _Case, members: int, every: int, weights: np.ndarray
 ) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-    """Create the run of a member, and the function from an index to initial data."""
+    """Return two functions: the run of a member, and initial data from its index."""
     chaotic = ChaoticSystem()
 
     def member(j: Array) -> tuple[Array, Array]:
@@ -416,8 +416,8 @@ def _figure(runs: list[ChaoticRun], title: str) -> "Figure":
 
 
 def _panel(ax: "Axes", runs: list[ChaoticRun], power: int) -> None:
-    # The error starts from zero. Limits of the axis that include the first steps would
-    # compress the curves.
+    # The error starts from zero. The lower limit of the axis leaves out the first tenth
+    # of the run, which would compress the curves.
     levels = []
     for i, run in enumerate(runs):
         h, times = run.dt, run.times
@@ -426,8 +426,8 @@ def _panel(ax: "Axes", runs: list[ChaoticRun], power: int) -> None:
         ax.plot(times, scaled, linewidth=0.4, alpha=0.35, color=f"C{i}")
         mean = _smoothed(scaled)
         ax.plot(times, mean, color=f"C{i}", linewidth=1.5, label=f"$h$ = {h:g}")
-        # Statistical errors at neighbouring times are correlated. Therefore the running
-        # mean is not more accurate than the value at a single time.
+        # The band is the standard error at a single time: errors at neighbouring times
+        # are correlated, so that the running mean is not more accurate.
         ax.fill_between(
             times, mean - spread, mean + spread, color=f"C{i}", alpha=0.2, linewidth=0
         )

@@ -61,7 +61,7 @@ class CVTRun:
 
     @property
     def key(self) -> str:
-        """Return the name of the run for files and arrays."""
+        """Return the prefix of the names of the run's arrays."""
         return f"{self.regime}_s{self.stages}_h{self.dt:.6g}"
 
     def deviations(self) -> np.ndarray:

@@ -97,7 +97,7 @@ class AbstractOrderStudy(AbstractStudyResult):
 
     def slopes(self) -> np.ndarray:
         """Return observed orders in the shape of `errors`; undefined orders are NaN."""
-        # The errors of a run to T = 3 stagnate below 1e-14.
+        # In runs to T = 3, round-off is below 1e-14: errors up to 1e-13 are ignored.
         return np.stack([slopes(self.dt, e, floor=1e-13) for e in self.errors])
 
     def orders(self) -> np.ndarray:

@@ -137,7 +137,7 @@ def initial_data(example: Any) -> dict[str, Any]:
 
 
 def environment() -> dict[str, Any]:
-    """Return the versions, the precision and the device that affect the numbers."""
+    """Return the versions, the precision and the device that affect the results."""
     device = jax.devices()[0]
     packages = ("nhjax", "jax", "jaxlib", "equinox", "numpy", "matplotlib")
     return {

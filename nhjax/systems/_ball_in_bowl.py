@@ -219,9 +219,10 @@ class BallInBowl(AbstractConstrainedGroupExample):
 def _steady_spin(ball: BallInBowl, rate: Array) -> Array:
     """Compute the spin that keeps a moving ball on its circle.
 
-    The balance of moments about the centre, I ω' = -a n × F with the force F of the
-    bowl, determines the spin. On the circle, ω turns about the vertical at the given
-    rate, so that ω' is along the path. `ball` is on the first axis and has no spin.
+    On the circle, ω turns about the vertical at the given rate, so that ω' is along the
+    path. The balance of moments about the centre, I ω' = -a n × F with the force F of
+    the bowl, therefore determines the radial component of ω. `ball` is on the first
+    axis and has no spin; the spin supplies the rest of this component.
     """
     normal, path = ball.bowl.normal(ball.q0[1]), ball.q0[1][0]
     moment = normal[0] * ball.gravity + normal[2] * rate**2 * path

@@ -18,8 +18,9 @@ from .._manifold import AbstractLieGroup
 from .._system import LagrangianSystem, parameter as parameter, State
 
 
-# The Gauss-Legendre rule of one panel. The rule is exact to round-off if the panel is
-# shorter than the distance to the nearest complex singularity of the integrand.
+# The Gauss-Legendre rule for one panel (subinterval). The rule is exact to round-off if
+# the panel is shorter than the distance to the nearest complex singularity of the
+# integrand.
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(20)
 
 
@@ -75,9 +76,9 @@ def require_nonzero(name: str, value: float, consequence: str) -> None:
 def require_consistent(name: str, violation: ArrayLike, scale: ArrayLike) -> None:
     """Raise if `name` violates a constraint by more than √ε (1 + |scale|).
 
-    Here ε is the machine epsilon. An exact solution uses the constraint to eliminate
-    velocities. For data that violate the constraint, its formula would silently give
-    the solution for other data.
+    Here ε is the machine epsilon, and |scale| the largest absolute value in `scale`. An
+    exact solution uses the constraint to eliminate velocities. With data that violate
+    the constraint, the formula would silently give the solution for other data.
     """
     largest = np.max(np.abs(np.asarray(violation)))
     sizes = np.asarray(scale)

@@ -115,7 +115,7 @@ class CarAxis(AbstractExample):
         return {}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute the places of both wheels and both axle ends, of shape (2,)."""
+        """Compute the places of both wheels and both axle ends, each of shape (2,)."""
         wheel = self._wheel(t, q)
         wheels = {"left_wheel": jnp.zeros_like(wheel), "right_wheel": wheel}
         return wheels | {"left_end": q[:2], "right_end": q[2:]}

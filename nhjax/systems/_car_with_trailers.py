@@ -81,7 +81,8 @@ class CarWithTrailers(AbstractNonholonomicExample):
     v0: Array = eqx.field(converter=coordinates, default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        # Equinox applies the converters of the fields after this method.
+        # Equinox applies the converters of the fields only after this method, so that
+        # this method converts `q0` itself.
         if self.num_trailers < 0:
             raise ValueError(
                 f"`num_trailers` must not be negative, got {self.num_trailers}."
@@ -125,6 +126,8 @@ class CarWithTrailers(AbstractNonholonomicExample):
         curvature, share = jnp.tan(steer) / car.wheelbase, jnp.ones_like(steer)
         headings = [jnp.zeros_like(steer)]
         for length, hitch in _hitches(car, steer.dtype):
+            # `share` is the speed of the vehicle in front over the speed of the car.
+            # The trailer turns at the car's rate if the angle satisfies
             # share · sin - hitch · curvature · cos = length · curvature.
             swing = hitch * curvature
             sine = length * curvature / jnp.hypot(share, swing)
@@ -151,7 +154,7 @@ class CarWithTrailers(AbstractNonholonomicExample):
     def velocity(
         self, q: Array, speed: ArrayLike, steer_rate: ArrayLike = 0.0
     ) -> Array:
-        """Compute the v that satisfies the constraints, given the rear axle's speed.
+        """Compute the consistent velocity for a given speed of the rear axle.
 
         Let v and θ̇ be the speed and the turning rate of the vehicle in front of a
         trailer, and β the heading of this vehicle minus the heading of the trailer. The
@@ -249,7 +252,7 @@ def _hitches(car: CarWithTrailers, dtype: DTypeLike) -> list[tuple[Array, Array]
 
 
 def _of_trailers(car: CarWithTrailers, name: str, dtype: DTypeLike) -> list[Array]:
-    """Return one value of a parameter for each trailer."""
+    """Return a parameter of the trailers as a list, one value for each trailer."""
     value = coordinates(getattr(car, name)).astype(dtype)
     if value.shape == ():
         return [value] * car.num_trailers

@@ -78,7 +78,7 @@ class ChaplyginSphere(AbstractRollingBody):
         return jnp.diag(self.moments)
 
     def lowest_point(self, up: Array) -> Array:
-        """Compute -r γ, where γ is `up`."""
+        """Compute the vector -r γ from centre to contact, where γ is `up`."""
         return -self.radius * up
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:

@@ -166,7 +166,7 @@ class FlyballGovernor(AbstractExample):
         return self._square_distances(q) - self.coupler_length**2
 
     def force(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Compute the forces of the dampers, and the torque `args` on the shaft."""
+        """Compute the generalised force of the dampers and of the torque `args`."""
         torque = given_forces(args, (), v.dtype, "a torque on the shaft")
         driving = jnp.zeros_like(v).at[0].set(torque)
         if self.couplers == "rods":

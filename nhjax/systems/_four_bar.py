@@ -76,7 +76,7 @@ class FourBar(AbstractExample):
         """
         first, second, third, ground = cls(**parameters).lengths
         theta, dtheta = parameter(angle), parameter(rate)
-        # The triangle of the crank's pin and the ends of the rocker.
+        # Solve the triangle of the crank's pin and the two ends of the rocker.
         side = jnp.stack([ground, jnp.zeros_like(ground)]) - first * direction(theta)
         square = side @ side
         distance = jnp.sqrt(square)
@@ -96,7 +96,7 @@ class FourBar(AbstractExample):
 
     @classmethod
     def parallelogram(cls) -> "FourBar":
-        """Create the benchmark: one loop of bars of 1 m and 1 kg each.
+        """Create the benchmark of the source: one loop of bars of 1 m and 1 kg each.
 
         At the start the crank is upright, and its end moves to the right at 1 m/s. When
         all bars are horizontal, first after 0.71 s, the constraints are dependent, and
@@ -134,7 +134,7 @@ class FourBar(AbstractExample):
         return {"energy_less_work": self.energy(t, q, v) - self.torque * q[0]}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute the places of the four joints around the loop, of shape (2,)."""
+        """Compute the places of the four joints of the loop, each of shape (2,)."""
         crank, coupler, _ = self._bars(q)
         ground = self._ground(q)
         joints = {"O": jnp.zeros_like(ground), "A": crank, "B": crank + coupler}

@@ -44,7 +44,7 @@ class AbstractGaitMachine(AbstractNonholonomicExample):
 
     @abc.abstractmethod
     def force(self, t: FloatScalarLike, q: Array, v: Array, args: Args) -> Array:
-        """Compute the force of the torques on the joints."""
+        """Compute the generalised force of the torques on the joints."""
 
     @property
     def system(self) -> LagrangianSystem:

@@ -11,7 +11,7 @@ from ._base import NODES, WEIGHTS
 
 
 def _integration_matrix() -> np.ndarray:
-    """Compute the weights that integrate the interpolant from -1 to each node."""
+    """Compute the map from values at the nodes to integrals from -1 to each node."""
     degrees = np.arange(NODES.size)
     projection = legendre.legvander(NODES, NODES.size - 1).T * WEIGHTS
     projection *= (degrees + 0.5)[:, None]

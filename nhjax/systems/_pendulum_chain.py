@@ -119,7 +119,7 @@ class PendulumChain(AbstractExample):
         return {"energy": self.energy(t, q, v)}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute the places of the pivot and of all masses, of shape (2,)."""
+        """Compute the places of the pivot and of all masses, each of shape (2,)."""
         places = q.reshape(-1, 2)
         masses = {f"mass_{k + 1}": places[k] for k in range(self.num_links)}
         return {"pivot": jnp.zeros_like(places[0])} | masses

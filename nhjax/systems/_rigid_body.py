@@ -121,7 +121,8 @@ def _euler_solution(
     amplitude3 = math.sqrt(w3**2 + ratio23 * w2**2)
     sigma = math.sqrt((I3 - I2) * (I3 - I1) / (I1 * I2)) * amplitude3
     modulus = min(ratio23 * (amplitude2 / amplitude3) ** 2, 1.0)
-    # cn and dn start positive; the direction of sn follows from Euler's equations.
+    # cn and dn start non-negative, so that their factors have the signs of w1 and w3.
+    # The sign of the factor of sn follows from Euler's equations.
     side1, side3 = math.copysign(1.0, w1), math.copysign(1.0, w3)
     parity = 1.0 if (two - one) % 3 == 1 else -1.0
     side2 = parity * side1 * side3 * math.copysign(1.0, I3 - I1)

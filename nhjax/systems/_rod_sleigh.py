@@ -160,7 +160,8 @@ class RodSleigh(AbstractNonholonomicExample):
         first = np.array([x, y]) - shift * normal
         slide = np.array([dx, dy]) + shift * omega * along
         second_slide = slide + omega * np.array([-rod[1], rod[0]])
-        # Only the rod exerts a force on the second mass.
+        # Only the rod exerts a force on the second mass, so that the acceleration of
+        # this mass gives the holonomic multiplier.
         tension = blade_force * math.sin(beta) / length + m1 * omega**2
         return (
             np.concatenate([first, first + rod]),

@@ -147,7 +147,7 @@ class RollerRacer(AbstractGaitMachine):
         return {} if self.gait is not None else {"energy": self.energy(t, q, v)}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute the places of the two axles and of the pivot, of shape (2,)."""
+        """Compute the places of the two axles and of the pivot, each of shape (2,)."""
         seat, handlebar = self._axles(q)
         pivot = seat + self.distances[0].astype(q.dtype) * direction(q[2])
         return {"seat": seat, "pivot": pivot, "handlebar": handlebar}

@@ -116,6 +116,6 @@ def _gudermannian(x):
 
 
 def _sech(x):
-    # In a long motion cosh would overflow, although 1/cosh only tends to zero.
+    # Use exp(-|x|), because cosh would overflow in a long motion.
     decay = np.exp(-np.abs(x))
     return 2 * decay / (1 + decay**2)

@@ -120,7 +120,7 @@ class SliderCrank(AbstractExample):
         return {"energy_less_work": self.energy(t, q, v) - self.torque * q[0]}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute the places of the axle, the pin and the slider, of shape (2,)."""
+        """Compute the places of the axle, pin and slider, each of shape (2,)."""
         pin = self._pin(q)
         return {"axle": jnp.zeros_like(pin), "pin": pin, "slider": self._slider(q)}
 

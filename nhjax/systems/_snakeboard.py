@@ -171,7 +171,7 @@ class Snakeboard(AbstractGaitMachine):
         }
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute the places of centre, axles and a rotor end, of shape (2,)."""
+        """Compute the places of centre, axles and a rotor end, each of shape (2,)."""
         rear, front = self._axles(q)
         rotor = q[:2] + self.half_length * direction(q[2] + q[3])
         return {"centre": q[:2], "rear": rear, "front": front, "rotor_end": rotor}

@@ -141,7 +141,7 @@ class SpatialSliderCrank(AbstractExample):
         return {"energy": self.energy(t, q, v)}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Array]:
-        """Compute the places of the axle, the pin and the slider, of shape (3,)."""
+        """Compute the places of the axle, pin and slider, each of shape (3,)."""
         pin = self._pin(q[0])
         axle = jnp.concatenate([jnp.zeros_like(pin[:1]), self.axle.astype(q.dtype)])
         return {"axle": axle, "pin": pin, "slider": _along(q[3])}

@@ -128,7 +128,8 @@ def _height(
     """Create the function that computes (z, ż) at given times.
 
     l²ż² is a cubic in z with the leading coefficient 2g and the roots z₁ <= z₂ <= z₃.
-    The cubic is written in powers of z - z₀, so that roots near z₀ lose no digits.
+    The cubic is written in powers of z - z₀, where z₀ is the height at time 0, so that
+    roots near z₀ lose no digits.
     """
     z0, dz0 = q0[2], v0[2]
     kinetic, radius_squared = 0.5 * (v0 @ v0), q0[0] ** 2 + q0[1] ** 2

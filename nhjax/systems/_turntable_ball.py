@@ -162,7 +162,10 @@ class TurntableBall(AbstractConstrainedGroupExample):
         }
 
     def first_integrals(self, q: tuple[Array, Array], v: Array) -> Array:
-        """Compute (ω_ζ, r ω_ξ - Ωx/(1 + a), r ω_η - Ωy/(1 + a)), for a = b = c."""
+        """Compute the conserved quantities of a homogeneous ball, a = b = c.
+
+        They are (ω_ζ, r ω_ξ - Ωx/(1 + a), r ω_η - Ωy/(1 + a)).
+        """
         omega = self.rolling_velocity(q, v)
         share = self.rate / (1.0 + self._moments(v)[0])
         return jnp.stack(

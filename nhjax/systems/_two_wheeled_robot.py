@@ -141,7 +141,7 @@ class TwoWheeledRobot(AbstractNonholonomicExample):
         return {"energy": self.energy(t, q, v)}
 
     def points(self, t: FloatScalarLike, q: Array) -> dict[str, Float[Array, "2"]]:
-        """Compute the middle of the axle, the centre of mass and the wheels."""
+        """Compute the places of wheels, centre of mass and the middle of the axle."""
         centre, right, left = self._centres(q)
         return {
             "axle": q[:2],
@@ -151,7 +151,7 @@ class TwoWheeledRobot(AbstractNonholonomicExample):
         }
 
     def _centres(self, q: Array) -> tuple[Array, Array, Array]:
-        """Compute the positions of the platform's centre, right and left wheel."""
+        """Compute the positions of the centre of mass, right wheel and left wheel."""
         cos, sin = jnp.cos(q[2]), jnp.sin(q[2])
         aside = self.half_track * jnp.stack([-sin, cos])
         centre = q[:2] + self.offset * jnp.stack([cos, sin])

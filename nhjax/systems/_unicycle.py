@@ -179,7 +179,8 @@ class UnicycleInCoordinates(AbstractConstrainedExample):
 def _lagrangian(
     unicycle: Unicycle | UnicycleInCoordinates, q: Array, v: Array
 ) -> Array:
-    # The kinetic energy is the same function of the body velocity and of (ẋ, ẏ, θ̇).
+    # The kinetic energy is the same function of the body velocity and of (ẋ, ẏ, θ̇), so
+    # that both classes share it.
     translation = 0.5 * unicycle.mass * (v[0] ** 2 + v[1] ** 2)
     rotation = 0.5 * unicycle.inertia * v[2] ** 2
     return translation + rotation - 0.5 * unicycle.spring * (q[0] ** 2 + q[1] ** 2)

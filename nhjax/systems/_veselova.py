@@ -84,5 +84,5 @@ class Veselova(AbstractConstrainedGroupExample):
         return {"energy": self.energy(t, q, v)}
 
     def horizontal_momentum(self, q: Array, v: Array) -> Array:
-        """Compute the first two components of R J ω, constant without weight."""
+        """Compute the horizontal part of R J ω, which is conserved without weight."""
         return self.manifold.matrix(q)[:2] @ (self.inertia.astype(v.dtype) @ v)

@@ -267,14 +267,14 @@ def _bodies(bicycle: WhippleBicycle, q: Array) -> list[_Body]:
 
 
 def _wheels(bicycle: WhippleBicycle, q: Array) -> tuple[_Wheel, _Wheel]:
-    """Return the rear and the front wheel of the upright bicycle."""
+    """Return the hub and radius of both wheels of the upright bicycle, rear first."""
     rear, front = bicycle.rear_radius, bicycle.front_radius
     hub = _in_plane(q, jnp.zeros_like(rear), -rear)
     return _Wheel(hub, rear), _Wheel(_in_plane(q, bicycle.wheelbase, -front), front)
 
 
 def _frames(bicycle: WhippleBicycle, q: Array) -> tuple[Frame, Frame]:
-    """Compute the rigid motions of rear and front frame from the upright bicycle."""
+    """Compute the rigid motions of both frames from the upright bicycle to `q`."""
     x, y, yaw, lean, pitch, steer = q[:6]
     rotation = about_z(yaw) @ about_x(lean) @ about_y(pitch)
     hub, radius = _wheels(bicycle, q)[0]

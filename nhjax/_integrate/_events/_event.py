@@ -174,10 +174,10 @@ class ConditionSigns(eqx.Module):
     def after_step(
         self, at_node: BoolScalar, values: Float[Array, " e"]
     ) -> "ConditionSigns":
-        """Return the signs at the node that a step reaches, or else the old signs.
+        """Return the signs at the node that a step reaches, otherwise the old signs.
 
         `at_node` is whether the step reaches a node, and `values` are the conditions
-        at this node.
+        at this node. A condition that is zero there keeps its old sign.
         """
         sign = jnp.where(values == 0, self.sign, jnp.sign(values))
         return ConditionSigns(
@@ -467,7 +467,7 @@ def state_from_reset(
 
 
 def _check_part(called: str, name: str, got: Any, like: Any) -> None:
-    """Raise unless a part of a reset state has the same arrays as in the old state."""
+    """Raise unless a part of a reset state has the shapes and dtypes of `like`."""
 
     def tree(x: Any) -> Any:
         return jax.tree.structure(x)

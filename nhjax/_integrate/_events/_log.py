@@ -19,7 +19,8 @@ class LogEntry(eqx.Module):
     - `node`, `offset`: the iteration started at t_k + offset, where k = `node`.
     - `size`: the size of the step that ended at the event; 0 if there was no step,
         because an earlier reset had carried the condition across zero.
-    - `scale`: the result of `ConditionSigns.scale` for the event in that step.
+    - `scale`: the size of the event's condition at the start of that step, computed by
+        `ConditionSigns.scale`.
     - `node_after`, `offset_after`: where the next iteration starts.
     """
 

@@ -63,7 +63,7 @@ class ImplicitTruncatedStep(AbstractImplicitFunction[Given, TruncatedStep]):
     where dg is the change of g at fixed step size. If g does not change with the step
     size, the derivative of θ h is NaN.
 
-    - `step`: the step of any size.
+    - `step`: takes a step of any size.
     - `signs`: the signs of the conditions at the start of the step.
     - `truncates`: whether to truncate the step at the first event in it.
     - `values_at_end`: if the step is truncated, the values of the conditions at the end
@@ -80,7 +80,7 @@ class ImplicitTruncatedStep(AbstractImplicitFunction[Given, TruncatedStep]):
 
     @property
     def programs(self) -> TraceCache | None:
-        """Return the cache of the step."""
+        """Return the step's cache of traced programs."""
         return self.step.programs
 
     def solve(self, arguments: Given) -> TruncatedStep:
@@ -224,7 +224,7 @@ class ImplicitTruncatedStep(AbstractImplicitFunction[Given, TruncatedStep]):
                 (size, y),
                 (unit, by_size[1]),
             )
-            # Without an event, a condition need not have a derivative.
+            # Without an event, set tangents to zero: a condition may lack a derivative.
             _, gained = jax.jvp(
                 lambda given, functions, y: condition(given, fixed, functions, y),
                 (given, functions, y),
@@ -337,7 +337,7 @@ class Bracket(eqx.Module):
         may_be_quadratic = (phi**2 < xi) & ((1 - phi) ** 2 < 1 - xi)
         quadratic = fa / (fb - fa) * fc / (fb - fc)
         quadratic = quadratic + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
-        # At first there are only two points.
+        # At first there are only two points, and the interpolation is linear.
         part = jnp.where(c == b, linear, jnp.where(may_be_quadratic, quadratic, 0.5))
         part = jnp.where((part >= 0) & (part <= 1), part, 0.5)
         places = jnp.where(self.crossed, a + part * (b - a), jnp.inf)

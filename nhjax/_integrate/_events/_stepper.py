@@ -321,7 +321,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         )
         result = RESULTS.where(attempt.is_taken, step.outcome.result, carry.result)
         if attempt.decision is not None:
-            # A step that is not solved may be repeated.
+            # The controller decides, because it may repeat a step that is not solved.
             decided = attempt.decision.result
             result = RESULTS.where(attempt.is_taken, decided, carry.result)
         result = RESULTS.where(attempt.meets, RESULTS.too_many_events, result)
@@ -338,7 +338,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
             is_bad = is_bad & (found != RESULTS.successful)
             result = RESULTS.where(is_bad, found, result)
             ends = ends | is_bad
-            # Iterations for events are not attempts at a step.
+            # The limit `max_steps` does not count iterations for events.
             rejected = attempt.is_rejected.astype(jnp.int32)
             number = after.node + carry.stats["num_rejected_steps"] + rejected
             is_last = jnp.asarray(i, jnp.int32) + 1 >= self.num_iterations
@@ -528,7 +528,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
         start = carry.step_state.differentiated_in_state()
         given = plain.args, plain.invariants, plain.noise
         arguments = StepArguments(plain.system, t, h, start, *given)
-        # The type checker sees the property `programs` as a field.
+        # The type checker takes the property `programs` for a missing field.
         step = ImplicitTruncatedStep(  # pyright: ignore[reportCallIssue]
             step=ImplicitStep(
                 method=plain.method,
@@ -786,7 +786,7 @@ class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
     def places(
         self, replay: ReplayedIteration, i: Int[Array, ""]
     ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-        """Return the indices of the output row and of the log entry of iteration i."""
+        """Return the output row and log entry of iteration i, or unused ones."""
         is_event = replay.which >= 0
         is_last = i.astype(jnp.int32) == self.end.place.num_iterations - 1
         ends_here = self._ended & is_last
