@@ -256,7 +256,8 @@ class Captured:
     """
 
     def __init__(self, functions: Any, ignored: Collection[Place] = ()):
-        # Stored, because the search after tracing must start from the same object.
+        # Stored, because `_remember_changes` searches again after tracing, and this
+        # second search must start from the same object.
         self.functions = functions
         self.atoms: list[Hashable] = []
         self.contents: dict[Place, tuple[object, Hashable]] = {}

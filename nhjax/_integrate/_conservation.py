@@ -161,8 +161,8 @@ def conserves(
 ) -> BoolScalar:
     """Return whether the rate of change of invariants is zero, at a state and near it.
 
-    The other states are random displacements of this state, moved onto the constraints
-    on velocities. States that still violate these constraints are ignored, and so are
+    The rate is also computed at some states near y: random displacements of y, moved
+    onto the constraints on velocities. States that still violate these constraints are ignored, and so are
     states at which the equations of motion have no solution. With holonomic
     constraints, only the velocity is displaced, because displaced positions and times
     may violate the constraints.

@@ -204,7 +204,7 @@ class ConstantStepSize(AbstractStepSizeController):
         return _size_of_user(context), memory
 
     def given_size(self, context: StepContext, node: Int[Array, ""]) -> FloatScalar:
-        """Return `dt` in the direction of the run."""
+        """Return `dt` with the sign of the direction of the run."""
         del node
         return _size_of_user(context)
 

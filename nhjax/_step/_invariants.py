@@ -201,8 +201,9 @@ class InvariantsAtStart(eqx.Module):
         energy.
     - `sizes`: the sizes of the terms of the invariants, to which their round-off is
         proportional.
-    - `position`: q_k before wrapping, and its accumulated rounding error. With both,
-        the invariants are kept at the rounded position at the end of the step.
+    - `position`: q_k before wrapping, and its accumulated rounding error. The end of
+        the step is computed and rounded from these two, so that the invariants are
+        kept at the rounded position.
     """
 
     functions: Invariants

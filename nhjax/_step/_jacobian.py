@@ -113,8 +113,9 @@ def simplified_newton_update(
 class MultiplierResponses(NamedTuple):
     """The changes of stages and nodes by a unit change of each multiplier unknown.
 
-    The last axis lists these unknowns, h δy of the closure and h δΛ. The responses are
-    stored only with the terms of order h, where they give the Schur complement.
+    The last axis lists these unknowns: h δy and h δΛ, the changes of `closure` and
+    `holonomic` in `StageUnknowns` times h. The responses are stored only with the terms
+    of order h, where they give the Schur complement.
     """
 
     velocity: Float[Array, "s n c"]

@@ -277,7 +277,7 @@ class Value:
         self.name = name
 
     def typed(self) -> str:
-        """Return the type and the name, the form of an instruction's first operand."""
+        """Return `type name`, as the first operand of an instruction is written."""
         return f"{self.writer.type(self.kind)} {self.name}"
 
     def _other(self, other: "Operand") -> "Value":

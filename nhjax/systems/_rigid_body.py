@@ -100,9 +100,10 @@ class FreeRigidBody(AbstractExample):
 def _euler_solution(
     moments: np.ndarray, omega0: np.ndarray
 ) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
-    """Find the solution ω(t) of Euler's equations, and its `rate` for `attitude`.
+    """Find the solution ω(t) of Euler's equations, and a bound on its rate.
 
-    This rate is a bound on |ω| and on the inverse of the time scale of ω.
+    The bound, the argument `rate` of `attitude`, is a bound on |ω| and on the inverse
+    of the time scale of ω.
 
     Let 2 be the principal axis with the middle moment, and 3 the principal axis around
     which ω moves in the body; axis 3 has the largest or the smallest moment. Then ω₁,
