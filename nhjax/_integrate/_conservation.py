@@ -162,10 +162,10 @@ def conserves(
     """Return whether the rate of change of invariants is zero, at a state and near it.
 
     The rate is also computed at some states near y: random displacements of y, moved
-    onto the constraints on velocities. States that still violate these constraints are ignored, and so are
-    states at which the equations of motion have no solution. With holonomic
-    constraints, only the velocity is displaced, because displaced positions and times
-    may violate the constraints.
+    onto the constraints on velocities. States that still violate these constraints are
+    ignored, and so are states at which the equations of motion have no solution. With
+    holonomic constraints, only the velocity is displaced, because displaced positions
+    and times may violate the constraints.
     """
     u0, manifold = system.fibre_coordinate(y), system.manifold_of(y.q)
     numbers = np.random.default_rng(0).standard_normal((2, _SAMPLES, u0.shape[0]))
