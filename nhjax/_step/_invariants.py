@@ -308,7 +308,7 @@ class InvariantCorrection(eqx.Module):
         # The gain is the ratio of the impulses to the impulses that a definite matrix,
         # the diagonal matrix of the row sums, would give for the same errors. With one
         # function it is Σ (row sum) ω² / |g|.
-        squares = at_start.covectors**2 + covectors**2
+        squares = at_start.slopes**2 + slopes**2
         roots = jnp.sqrt(jnp.sum(at_start.row_sums[None] * squares, axis=1))
         gain = roots[:, None] * solved * (errors * roots)[None]
         acts = ~(at_start.functions.least_part * max_norm(gain) > 1)

@@ -204,3 +204,39 @@ def test_invariant_energy_with_ill_conditioned_definite_mass_matrix_is_conserved
     energies = jax.vmap(lambda y: system.energy(0.0, y))(sol.ys)
     assert float(sol.stats["max_invariant_error"]) < 1e-14
     np.testing.assert_allclose(energies, energies[0], rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("mass", [0.01, 1.0, 100.0])
+def test_invariant_steps_in_the_hamiltonian_form_equal_the_lagrangian_ones(mass):
+    """Which steps keep the energy must not depend on the form or the unit of mass."""
+    masses = mass * jnp.array([1.0, -2.0])
+
+    def potential(q):
+        return 0.5 * masses @ q**2 + mass * (0.3 * q[0] ** 4 + 0.1 * (q[0] * q[1]) ** 2)
+
+    forms = (
+        nhjax.LagrangianSystem(
+            lambda t, q, v, args: 0.5 * masses @ v**2 - potential(q)
+        ),
+        nhjax.HamiltonianSystem(
+            lambda t, q, p, args: 0.5 * (1 / masses) @ p**2 + potential(q)
+        ),
+    )
+    q, errors = [], []
+    for system in forms:
+        y0 = nhjax.initial_state(system, jnp.array([1.0, 0.3]), jnp.array([0.2, 0.9]))
+        sol = nhjax.integrate(
+            system,
+            nhjax.LobattoIIIAB(2),
+            y0,
+            dt=0.1,
+            num_steps=200,
+            invariants="energy",
+            saveat=nhjax.SaveAt(steps=1),
+        )
+        q.append(sol.ys.q)
+        errors.append(float(sol.stats["max_invariant_error"]))
+    # In some steps no impulses keep the energy.
+    assert errors[0] > 1e-5
+    np.testing.assert_allclose(q[1], q[0], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(errors[1], errors[0], rtol=1e-8)
