@@ -270,7 +270,10 @@ def _raise_where(
     arrays: list[Array],
     described: PyTree[Any],
 ) -> T:
-    """Return `tree`, or raise `error`; `described` has places instead of arrays."""
+    """Return `tree`, or raise an exception; see `raise_where`.
+
+    `described` is its argument `values`, with a `_Place` instead of each array.
+    """
     # The call-back outlives the trace: it may use shapes and dtypes of traced arrays,
     # but not the arrays.
     kinds = [(x.shape, x.dtype) for x in arrays]
@@ -299,7 +302,7 @@ def _raise_where(
 def _packed(arrays: list[Array]) -> tuple[list[Array], list[tuple[int, slice]]]:
     """Join the arrays of each dtype to a vector; return also where each array is.
 
-    Otherwise XLA would compile a kernel for each array that is converted to bits.
+    If arrays were not joined, XLA would compile a kernel to convert each one to bits.
     """
     groups: dict[Any, list[Array]] = {}
     slices = []

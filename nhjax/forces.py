@@ -1,8 +1,8 @@
 """Forces and torques on points and bodies, as generalised forces of a system.
 
 A force f that acts on a point x(t, q) has the power f · ẋ. The generalised force is
-F = (∂x/∂q)ᵀ f on a vector space, and F = L_g^* (∂x/∂g)ᵀ f on a group. Then
-F · v = f · ẋ if x does not depend explicitly on time.
+F = (∂x/∂q)ᵀ f on a vector space, and F = L_g^* (∂x/∂g)ᵀ f on a group, with the left
+translation L_g. Then F · v = f · ẋ if x does not depend explicitly on time.
 """
 
 import abc
@@ -88,7 +88,7 @@ def function_or_numbers(value: Any) -> Any:
 
 
 def function_or_not_negative(value: Any) -> Any:
-    """Convert a number, positive or zero, or check a function."""
+    """Convert a number >= 0 to an array, or check a function."""
     return function_or_numbers(value) if callable(value) else not_negative(value)
 
 
@@ -101,8 +101,8 @@ def position_function(value: Any) -> Any:
 def of_phase(name: str, value: Any, like: Array, *arguments: Any) -> Array:
     """Return a parameter, or its value if it is a function, in the dtype of `like`.
 
-    Another shape than that of `like` raises a `ShapeError`. The user's function takes
-    (t, q, v, args) or (t, q, v, multipliers, args).
+    A value of another shape than `like` raises a `ShapeError`. The user's function
+    takes (t, q, v, args) or (t, q, v, multipliers, args).
     """
     if callable(value):
         names = ["t", "q", "v", "args"]
@@ -383,8 +383,8 @@ class Spring(_AbstractPulledBack):
     points stay apart.
 
     `system.energy` does not include the energy of a `Spring`. To include it, add
-    -½ k (|d| - l)² to the Lagrangian instead of using a `Spring`. Both give the same
-    steps. A damper cannot be included in this way.
+    -½ k (|d| - l)² to the Lagrangian instead of using a `Spring`. The steps are the
+    same. A damper cannot be included in this way.
 
     **Arguments:**
 

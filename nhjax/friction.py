@@ -406,8 +406,9 @@ class RollingResistance(_AbstractOnContact):
 class PivotingFriction(_AbstractOnContact):
     """Friction against spinning about the normal of the plane.
 
-    The torque about the normal n is -|N| e tanh(ω · n / ω₀). For a circular contact
-    area of radius a with uniform pressure, e = 2/3 μ a.
+    The torque about the normal n is -|N| e tanh(ω · n / ω₀), with the body's angular
+    velocity ω. For a circular contact area of radius a with uniform pressure,
+    e = 2/3 μ a.
 
     **Arguments:** as for `RollingResistance`, but `arm` is the length e [m] in the
     formula above, and `smoothing` is ω₀ [rad/s] for the spin ω · n.

@@ -57,7 +57,8 @@ class SystemReport(eqx.Module):
         `dependent` are then not unique.
     - `depends_on_time`: the names of the functions that depend on t.
     - `ignorable`: the indices of coordinates that no function depends on near the given
-        state. A coordinate is not found if its terms cancel but leave round-off.
+        state. A coordinate is missed if terms that contain it cancel only up to
+        round-off.
     - `constant`: the names of constant matrices, among the mass matrix and the
         Jacobian of the nonholonomic constraints.
     """
@@ -179,8 +180,8 @@ def check_system(
     rates = letters[:m] + [f"d{name}/dt" for name in letters[m:]]
     values = [*found["constraints"], *found["position_constraints"]]
     changes = {key: _changes(found[key]) for key in (_MASS, _JACOBIAN)}
-    # Only finite rows are reported as dependent. Any other row makes the condition
-    # number of C infinite.
+    # Only finite rows are reported as dependent. A row that is not finite makes the
+    # condition number of C infinite.
     rows = dependent_rows(found["jacobian"]) if found["deficient"] else []
     moving = np.any(_changes(found["by_position"]), axis=0)
     return SystemReport(
@@ -299,8 +300,8 @@ def _derivatives(system, t, q, u, args, near) -> dict[str, Any]:
     vanishes = jnp.max(jnp.abs(rows), axis=1) <= zero
     rows = jnp.where(vanishes[:, None], 0, rows)
     mass, rows = convert_to_velocities(system, hessian(t, jnp.zeros_like(u), u), rows)
-    # For these values, the only check is that they are finite. Constraints are returned
-    # separately.
+    # `check_system` requires these values to be finite. The values of constraints are
+    # returned separately.
     values = {
         name: function(t, jnp.zeros_like(u), u)
         for name, function in functions.items()

@@ -1,10 +1,10 @@
 """The equations of motion and the constraints, linearised at one state.
 
-A perturbation x = (ξ, w) changes the state (q, u) to (q τ(ξ), u + w). This file
-differentiates the equations with respect to x, in a frame that moves with the velocity
-or along symmetries. It also computes bases of the perturbations that the constraints
-permit. It checks that given generators are symmetries of the system, and that the
-motion is an orbit of these symmetries.
+A perturbation x = (ξ, w) changes the state (q, u), where u is v or p, to
+(q τ(ξ), u + w). This file differentiates the equations with respect to x, in a frame
+that moves with the velocity of the state or along symmetries. It also computes bases of
+the perturbations that the constraints permit. It checks that given generators are
+symmetries of the system, and that the motion is an orbit of these symmetries.
 """
 
 import operator
@@ -33,8 +33,8 @@ Symmetry = Callable[[Any], Array]
 class Orbit(NamedTuple):
     """The generators of symmetries and the equations of motion near a state.
 
-    - `directions`: the generators at the state, as vectors of perturbations.
-    - `jacobians`: their derivatives with respect to perturbations x = (ξ, w).
+    - `directions`: the generators at the state, each as a perturbation x = (ξ, w).
+    - `jacobians`: their derivatives with respect to x.
     - `motion`, `motion_jacobian`: the vector field of the equations of motion at the
         state, and its derivative.
     - `nearby`: the derivatives of the equations of motion and of the generators, in
@@ -57,7 +57,7 @@ class Orbit(NamedTuple):
 
     @property
     def rates(self) -> Float[Array, "x x"]:
-        """Return the derivative of the motion relative to the moving frame."""
+        """Return the derivative of motion - Σ c_k (generator k) for fixed c_k."""
         frame = jnp.einsum("k,kxy->xy", self.coefficients, self.jacobians)
         return self.motion_jacobian - frame
 
@@ -180,9 +180,10 @@ def rates_of_change(
 ) -> Callable[[Float[Array, " x"]], Float[Array, " x"]]:
     """Return the function x -> (v - v_0 - ad_v₀ ξ, u̇) of perturbations x = (ξ, w).
 
-    Its derivative at zero gives the linearised equations of motion: in the frame of a
-    body that moves with v_0, a perturbation of the configuration changes at the rate ξ̇
-    = δv - ad_v₀ ξ.
+    v and u̇ belong to the perturbed state, and v_0 is the velocity of `y`. The
+    derivative at zero gives the linearised equations of motion: in the frame of a body
+    that moves with v_0, a perturbation of the configuration changes at the rate
+    ξ̇ = δv - ad_v₀ ξ.
     """
     manifold = system.manifold_of(y.q)
     v0 = system.velocity(t, y.q, system.fibre_coordinate(y), args)
@@ -211,7 +212,7 @@ def lift_generators(
     u: Float[Array, " n"],
     args: Args,
 ) -> tuple[Float[Array, "k n"], Float[Array, "k n"]]:
-    """Compute the generators ξ at q, and the rates δu of u under their flows.
+    """Compute generators ξ at q, and the rates δu of u (v or p) under their flows.
 
     The flow of a vector field q ξ(q) transports velocities by its derivative, and
     momenta by the inverse transpose of this derivative,

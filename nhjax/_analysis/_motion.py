@@ -87,8 +87,9 @@ def motion(
 
     M v̇ - Bᵀ λ = ad*_v p + D1L + F - (∂t + D1 v) p,    B v̇ = -(∂t + D1 v) Φ,
 
-    or the corresponding equations of a Hamiltonian system. To save reactions along a
-    trajectory, use
+    or the corresponding equations of a Hamiltonian system. Here D1 is the derivative
+    with respect to q, D1 v this derivative along v, and F the force. To save reactions
+    along a trajectory, use
     `SaveAt(fn=lambda t, y, args: nhjax.motion(system, t, y, args).reaction)`.
 
     **Arguments:**

@@ -131,8 +131,9 @@ def steady_motion(
     - `symmetry`: generators of symmetries, as `linear_stability` takes them, in place
         of `positions` and `velocities`.
     - `held_positions`, `held_velocities`: the indices of the positions and velocities
-        that keep their values in `y`. On a group, the configuration of the result is
-        q τ(ξ) with the configuration q of `y`, and holding position i means ξ_i = 0.
+        that keep their values in `y`. On a group with the retraction τ, the result has
+        the configuration q τ(ξ), where q is the configuration of `y`. Holding position
+        i then means ξ_i = 0.
     - `max_iterations`: the largest number of iterations.
 
     **Returns:** a consistent `State`. With `symmetry`, a pair of the state and the
@@ -141,7 +142,8 @@ def steady_motion(
     with the same `symmetry`. Both results are twice differentiable with respect to `y`
     and `args` by the implicit function theorem, if the steady motion is unique for the
     held values, or unique up to ignorable coordinates. In any other family of
-    solutions, the derivative is the derivative of one more Newton increment.
+    solutions, the increment to `y` has the least-norm derivative that satisfies the
+    differentiated equations.
 
     **Raises:** `NewtonError` if no steady motion is found near `y`. `ValueError` or
     `TypeError` if an index is wrong. `ValueError` if neither or both of the two ways
@@ -187,8 +189,8 @@ def steady_motion(
         )
     check_symmetry(symmetry, y)
     outcome = solve_along_symmetry(system, t, y, args, symmetry, held, max_iterations)
-    # The check uses the compiled program of `linear_stability`, so that a later call of
-    # `linear_stability` does not compile it again.
+    # The symmetries are checked by a compiled program that `linear_stability` uses too,
+    # so that a later call of `linear_stability` does not compile it again.
     given = stop_gradient((system, t, outcome.state, args))
     conditions = _symmetry_conditions(
         linearise_along_symmetry(*given, symmetry), given[2]
@@ -293,7 +295,7 @@ def solve_along_symmetry(
         ]
         return motion, jnp.concatenate(lifts, axis=1), constraints
 
-    # The rates for which the combination of generators is closest to the velocity.
+    # Start from the rates c for which Σ c_k X_k is closest to the velocity.
     here = stop_gradient(
         lift_generators(system, symmetry, t, y.q, system.fibre_coordinate(y), args)
     )
@@ -382,7 +384,7 @@ def least_norm_root(
     **Returns:** the root, the residual at the root, and the result of the iteration.
     """
     residual = ClosureConverted(residual, start)
-    # Derivatives come from the two steps after the iteration. Without `stop_gradient`,
+    # Derivatives come from the two steps of `refined` below. Without `stop_gradient`,
     # JAX would also differentiate the loop, which jax 0.10.1 cannot do twice.
     fixed_residual, start = stop_gradient((residual, start))
 
@@ -401,7 +403,7 @@ def least_norm_root(
     )
     x, (inverse, jacobian) = stop_gradient((solved.x, solved.aux))
 
-    # With a fixed Jacobian, each further step corrects one more order of derivatives.
+    # Each step with the fixed Jacobian makes one more order of derivatives correct.
     def refined(x, _):
         left = residual(x)
         return x - inverse @ left, left

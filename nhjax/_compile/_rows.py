@@ -1,7 +1,8 @@
 """Functions that are applied to each row of some arrays, as one operation of a program.
 
-One operation keeps programs short. With a copy of a long function for each stage of a
-method, a program and the time to compile it would grow with the number of stages.
+One operation keeps programs short. With a copy of a long function for each row, such
+as each stage of a method, a program and the time to compile it would grow with the
+number of rows.
 """
 
 from collections.abc import Callable

@@ -40,8 +40,8 @@ def _written_out(
     x, y = _aligned(a, first, order), _aligned(b, second, order)
     if not by_terms:
         return jnp.sum(x * y, axis=tuple(range(len(result), len(order))))
-    # The terms are added one by one, because XLA would leave so large a reduction to a
-    # library.
+    # The terms are added one by one, because XLA calls a library to reduce arrays of
+    # more than `LARGEST_REDUCTION` elements.
     ranges = (range(a.shape[first.index(index)]) for index in summed)
     return reduce(
         jnp.add, (x[..., *k] * y[..., *k] for k in itertools.product(*ranges))

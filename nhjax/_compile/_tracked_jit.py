@@ -37,8 +37,8 @@ Place: TypeAlias = tuple[int, Hashable]
 Part: TypeAlias = tuple[object, Hashable, Any]
 T = TypeVar("T")
 
-# At most this many values are compared. If functions read more values, the other values
-# are ignored, because comparing them would take longer than a short run.
+# At most this many of the values that functions read are compared. Further values are
+# ignored, because comparing them would take longer than a short run.
 MOST_ENTRIES = 2000
 # These libraries are recognised by their names, because they may be installed from a
 # working copy, outside of the usual folders.
@@ -103,7 +103,7 @@ class _Unrepeatable:
 def _is_leaf(cls: type) -> bool:
     """Return whether values of a class have no parts.
 
-    Arrays count as values without parts, although arrays of objects have parts.
+    NumPy's arrays count as values without parts, although arrays of objects have some.
     """
     return issubclass(cls, _LEAVES) and not issubclass(cls, enum.Enum)
 
@@ -246,9 +246,9 @@ def static_parts(tree: Any) -> list[Any]:
 class Captured:
     """The values that functions read, except at the ignored places.
 
-    - `atoms`: the values in a fixed order, each with the number of its owner and its
-      name in the owner. Objects have numbers in the order of the search, so that a new
-      function equal to an old one has equal atoms.
+    - `atoms`: for each value, the number of its owner, its name in the owner and the
+      data by which it is compared. Objects are numbered in the order in which they are
+      found, so that a new function equal to an old one has equal atoms.
     - `contents`: the owner and the content of each place; the content of an object with
       parts is its identity. The owners are stored, so that no other object gets the
       same identity.
@@ -256,8 +256,8 @@ class Captured:
     """
 
     def __init__(self, functions: Any, ignored: Collection[Place] = ()):
-        # Stored, because `_remember_changes` searches again after tracing, and this
-        # second search must start from the same object.
+        # The functions are stored, because `_remember_changes` lists their values again
+        # after tracing, and must start from the same object.
         self.functions = functions
         self.atoms: list[Hashable] = []
         self.contents: dict[Place, tuple[object, Hashable]] = {}
@@ -271,7 +271,7 @@ class Captured:
                 continue
             content = atom = _atom(value)
             if isinstance(atom, _Unrepeatable):
-                # Tracing may replace a stored tracer by another: compare identities.
+                # Tracing may replace a tracer by another one: compare identities.
                 content = _Identity(id(value), value)
                 self.is_repeatable = False
             has_objects = isinstance(value, np.ndarray) and value.dtype.hasobject
@@ -304,7 +304,7 @@ class _Key:
 # more.
 _MOST = 1000
 _changed_by_tracing: dict[Place, object] = {}
-# This maps the key after tracing to the key with which the program was traced.
+# This maps the key without ignored values to the key at the time of tracing.
 _key_before_tracing: dict[_Key, _Key] = {}
 
 

@@ -140,13 +140,13 @@ class Lock:
 
 
 class Journal:
-    """The journal of a store: one line of JSON for each finished chunk.
+    """The journal of an ensemble's store: a line of JSON for each finished chunk.
 
-    Process 0 appends to the journal. Every other process appends to its own part, which
-    it locks while it runs. A run begins and ends with a single journal: process 0 first
-    appends the parts that an interrupted run has left, and at the end writes the lines
-    of all processes in the order of chunks. `lines` contains the lines that this
-    process has written.
+    Process 0 appends to the journal. Every other process appends to a file of its own,
+    a part, which it locks while it runs. A run begins and ends with a single journal:
+    process 0 first appends the parts that an interrupted run has left, and at the end
+    writes the lines of all processes in the order of chunks. `lines` contains the lines
+    that this process has written.
     """
 
     def __init__(self, folder: Path, index: int):
@@ -182,7 +182,7 @@ class Journal:
         self.lines[line["chunk"]] = line
 
     def finish(self, lines: dict[int, Line]) -> None:
-        """Write these lines in the order of chunks, and delete the parts."""
+        """Write `lines` in the order of chunks, and delete the parts."""
         content = _as_bytes([lines[chunk] for chunk in sorted(lines)])
         write_if_different(self.path, content)
         for part in self.folder.glob(_PARTS):

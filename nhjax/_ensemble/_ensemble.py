@@ -54,9 +54,9 @@ def ensemble(
     of a chunk over all devices. The last chunk is padded with members that are ignored.
 
     If `run` returns an `nhjax.Solution` or `nhjax.RESULTS`, alone or as part of a tree,
-    the outcome lists the members whose runs failed, and statistics leave them out. In
-    `run`, call `nhjax.integrate` with `throw=False`; otherwise the first failure ends
-    the whole ensemble.
+    the outcome lists the members whose runs failed, and the statistics of `reduce` do
+    not include them. In `run`, call `nhjax.integrate` with `throw=False`; otherwise the
+    first failure ends the whole ensemble.
 
     After `jax.distributed.initialize`, all processes must make the same call. Each
     process runs its share of the chunks on its own devices, and returns the whole
@@ -66,13 +66,13 @@ def ensemble(
 
     - `run`: a function of one member that returns a tree of arrays.
     - `members`: a tree of arrays with the members as leading axis, or a function from
-        the index of a member to the member. JAX traces the function, and each chunk
-        creates its members, which saves memory.
+        the index of a member to the member. JAX traces this function, and each
+        chunk creates only its own members, which saves memory.
     - `num_members`: the number of members, if `members` is a function.
-    - `out`: a folder for a Zarr store, to which the values of each chunk are written.
-        `xarray.open_zarr` opens the store. If a run is interrupted, the same call
-        resumes it. With `reduce`, the folder holds the states of the reductions
-        instead of values. See `docs/ensembles.md`.
+    - `out`: a folder for a Zarr store, to which the values that `run` returns are
+        written, chunk by chunk. `xarray.open_zarr` opens the store. If a run is
+        interrupted, the same call resumes it. With `reduce`, the folder holds the
+        states of the reductions instead of values. See `docs/ensembles.md`.
     - `reduce`: an `nhjax.Mean`, `nhjax.Variance`, `nhjax.Minimum`, `nhjax.Maximum`,
         `nhjax.Histogram`, your own `nhjax.AbstractReduction`, or a tree of these such
         as a dictionary. With `reduce`, values are not kept, and memory does not grow
@@ -95,7 +95,7 @@ def ensemble(
     **Returns:** an `nhjax.EnsembleOutcome` with `values` or `statistics`, or with
     neither if values were written to `out`.
 
-    **Raises:** `nhjax.ShapeError` for arrays that differ in their leading axis;
+    **Raises:** `nhjax.ShapeError` for arrays with leading axes of different lengths;
     `TypeError` if `run` returns anything except arrays; `ValueError` for invalid
     numbers, for a store that is damaged or belongs to other arguments, and if processes
     call `ensemble` with different arguments; `RuntimeError` for a store that another

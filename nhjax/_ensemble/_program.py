@@ -29,7 +29,7 @@ from ._processes import Processes
 from ._reductions import AbstractReduction
 
 
-# The number that stands for an unknown step.
+# The number that stands for the failed step if its index is not known.
 UNKNOWN_STEP = -1
 # The name of the mesh axis along which members are spread over devices.
 AXIS = "members"
@@ -465,7 +465,7 @@ def first_failure(value: Any) -> tuple[Int[Array, ""], Int[Array, ""]]:
 
 
 def results_as_codes(value: Any) -> Any:
-    """Replace `RESULTS` by their codes, except in a solution."""
+    """Replace `RESULTS` by their codes; return a `Solution` unchanged."""
     if isinstance(value, Solution):
         return value
     return jax.tree.map(
@@ -509,8 +509,8 @@ def call_description(
 ) -> dict[str, Any]:
     """Describe the data that must agree in all processes of a common job.
 
-    The data are a manifest, a digest of the text of the program, a flag for `out`, and
-    `others`.
+    The data are the manifest `made`, a digest of the program's `text`, whether the job
+    writes to a store (`out`), and `others`.
     """
     run = hashlib.sha256(text.encode()).hexdigest()
     return {"out": out, "reduce": None} | made | {"run": run} | others

@@ -59,7 +59,8 @@ class Mean(AbstractReduction):
     """The mean over the members of an ensemble, for every number that `run` returns.
 
     mean = (1/n) Σ x_j. The sums are double-double numbers (Hida, Li, Bailey, 2001), so
-    that for any chunk size there are two rounding errors: of the sum and the quotient.
+    that for any chunk size only two roundings matter: of the final sum to one number,
+    and of its quotient by n.
 
     **Arguments:**
 
@@ -297,7 +298,8 @@ class Histogram(AbstractReduction):
     - `of`: a function that selects, from the value of a member, the part to count; by
         default everything.
 
-    **Returns:** the outcome has an `nhjax.HistogramCounts` in place of each array.
+    **Returns:** `statistics` is the value of one member with an
+    `nhjax.HistogramCounts` in place of each array.
 
     **Raises:** `ValueError` if the edges do not increase or are not finite.
 
@@ -535,7 +537,7 @@ def _double_vectors(tree: Any) -> list["DoubleDouble"]:
 
 
 def _as_doubles(vectors: list["DoubleDouble"], tree: Any) -> Any:
-    """Undo `_double_vectors`: return a tree like `tree` with the numbers in vectors."""
+    """Undo `_double_vectors`: return a tree like `tree` with numbers of `vectors`."""
     place = {x.high.dtype: (x, 0) for x in vectors}
 
     def part(like: DoubleDouble) -> DoubleDouble:
@@ -605,7 +607,7 @@ def _difference(a: DoubleDouble, b: DoubleDouble) -> Array:
 
 
 class _Sums(NamedTuple):
-    """The number of members, and a tree of `DoubleDouble`, the sums of their values."""
+    """The number of members, and the sums of their values: a tree of `DoubleDouble`."""
 
     number: Int[Array, ""]
     sums: Any

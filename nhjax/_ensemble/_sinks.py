@@ -80,7 +80,10 @@ class EnsembleOutcome(eqx.Module):
 
 
 class FailureList:
-    """The members that failed, as rows (index, step, code), in the order of chunks."""
+    """The members that failed, as rows (index, step, code), in the order of chunks.
+
+    `code` is the integer value of the member's `RESULTS`.
+    """
 
     def __init__(self, rows: list[list[int]] | None = None):
         self.rows = [] if rows is None else rows
@@ -254,7 +257,7 @@ class ReductionSink(AbstractSink):
             self.job.processes.check_same_call(call)
 
     def remaining_chunks(self) -> Iterable[int]:
-        """Return the chunks of this process, from `first_chunk` on."""
+        """Return this process's chunks; with `in_rounds`, from `first_chunk` on."""
         processes = self.job.processes
         if self.in_rounds:
             start = self.first_chunk + processes.index

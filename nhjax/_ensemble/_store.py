@@ -2,9 +2,9 @@
 
 `ZarrSink` writes the values of members to a store of Zarr, and
 `CheckpointedReductionSink` writes the states of reductions. Both lock the folder while
-they write, keep the manifest and the text of the program in it, and refuse to resume
-the run of another job. The format of their files is part of the interface: files of an
-earlier release remain readable.
+they write, store in it the text of the program and a manifest that describes the job,
+and refuse to resume the run of another job. The format of their files is part of the
+interface: files of an earlier release remain readable.
 """
 
 import hashlib
@@ -122,7 +122,7 @@ class ZarrSink(AbstractSink):
             self.journal.append(line)
 
     def outcome(self) -> EnsembleOutcome:
-        """Finish the journal, label a common time axis, and create the outcome."""
+        """Finish the journal, label the times if all agree, and create the outcome."""
         processes = self.job.processes
         self.journal.close()
         new = json.dumps([*self.journal.lines.values()]).encode()
@@ -176,7 +176,7 @@ class ZarrSink(AbstractSink):
         if processes.index > 0:
             self._check_shared(shared[0])
             self.journal.open_part()
-        # All processes wait here until all parts are locked.
+        # Wait until each process has locked its part of the journal.
         processes.allgather()
         return {line["chunk"]: line for line in shared[1]}
 
@@ -270,8 +270,8 @@ class ZarrSink(AbstractSink):
 class CheckpointedReductionSink(AbstractSink):
     """Writes the states of reductions to a folder after each round of chunks.
 
-    The state, the failures and the number of finished chunks are in one file, which
-    process 0 replaces atomically.
+    In a round, each process runs one chunk. The state, the failures and the number of
+    finished chunks are in one file, which process 0 replaces atomically.
     """
 
     in_rounds = True
@@ -459,7 +459,7 @@ def _program_difference(old: str, new: str) -> list[str]:
 
 
 def _empty_variables(job: Job) -> dict[str, Any]:
-    """Return, by name, the axes and one uninitialised row of the arrays of values."""
+    """Return the axes and one uninitialised row of each array of values, by name."""
     empty = jax.tree.map(lambda x: np.empty((1, *x.shape), x.dtype), job.structure)
     made = named_arrays(results_as_codes(empty), _BATCH)
     for name, (dims, x) in made.items():

@@ -688,9 +688,9 @@ def _linkage(
 ) -> Looks:
     """Return the looks of bars between points, with balls and boxes at some of them.
 
-    Points with two coordinates are drawn in a vertical plane. `masses` are the radii of
-    the balls, divided by the length of the longest bar; `boxes` are the names of
-    sliders; `fixed` are the names of points that stay at rest.
+    Points with two coordinates are drawn in a vertical plane. `masses` maps the names
+    of points to the radii of their balls, divided by the length of the longest bar;
+    `boxes` are the names of sliders; `fixed` are the names of points at rest.
     """
 
     def in_space(t, q):
@@ -863,7 +863,7 @@ def _car_axis(machine: systems.CarAxis) -> Looks:
 
 
 def _trails(machine: Any, *names: str) -> Callable[..., Array]:
-    """Return a function for the `trails` of named points, drawn on the ground."""
+    """Return a `trails` function for named points; points (x, y) lie on the ground."""
 
     def trails(t, q, args):
         points = machine.points(t, q)

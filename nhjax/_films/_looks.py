@@ -1,4 +1,4 @@
-"""The looks of a machine: shapes in MJCF, and the poses of the bodies that have them.
+"""The looks of a machine: shapes in MJCF, and the poses of the bodies they belong to.
 
 The functions after the class `Looks` write the shapes of the gallery's machines. In
 these functions, a wheel has its axle along the y axis of its body, and a body that lies

@@ -57,8 +57,8 @@ def render(
     - `speed`: the number of seconds of the motion in a second of the film.
     - `size`: the width and the height in pixels; both must be even for `.mp4`.
     - `t`: the time of the picture, only for `.png`. The default is the end of the run.
-    - `trail`: whether to draw the paths of contact points, or the `trails` of a
-        `Looks`.
+    - `trail`: whether to draw the paths of a machine's contact points or, for a
+        `Looks`, of its `trails`.
 
     **Returns:** the path of the file.
 
@@ -98,7 +98,7 @@ def render(
 
 
 class View(NamedTuple):
-    """A named camera of the model, or a free camera and the points it looks at."""
+    """A named camera of the model, or a free camera and its target in each frame."""
 
     name: str | None
     centres: np.ndarray
@@ -199,7 +199,7 @@ def _renderer(scene: Scene, size: tuple[int, int]) -> Iterator[Any]:
 
 
 def _draw_trails(mujoco: Any, drawn: Any, scene: Scene, k: int) -> None:
-    """Add the paths from the first to the k-th time to the shapes of a picture."""
+    """Add the `trails` of a scene, up to its k-th time, to the shapes of a picture."""
     kind = mujoco.mjtGeom.mjGEOM_CAPSULE
     width = 0.006 * scene.model.stat.extent
     for path in scene.trails:
@@ -276,7 +276,7 @@ def _checked(
 
 
 def _until(times: np.ndarray, ends: tuple[float, float], end: float) -> np.ndarray:
-    """Return the times of frames before a time between `ends`, and this time."""
+    """Return the times of the frames before the time `end`, followed by `end`."""
     low, high = sorted(ends)
     if not low <= end <= high:
         raise ValueError(f"render: `t` must be between {low} and {high}, got {end}.")

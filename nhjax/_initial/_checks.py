@@ -35,11 +35,12 @@ class Found(NamedTuple):
     - `lin`: the linearisation of the equations of motion at the state.
     - `off_group`: the distance of q, given or projected, from its group.
     - `regularity`, `compatibility`: the reciprocal condition numbers of the metric on
-        the fibre and of the compatibility matrix.
+        the fibre, D2D2L or D2D2H, and of the compatibility matrix.
     - `ranks`, `deficient`: the constraint derivatives whose rank is checked, and
         whether each lacks full rank. For redundant constraints, the rank is deficient
         only if a row is zero.
-    - `allowed`, `allowed_positions`, `allowed_off_group`: the bounds on violations.
+    - `allowed`, `allowed_positions`, `allowed_off_group`: the bounds on the violations
+        of constraints on velocities and on positions, and on `off_group`.
     - `legendre_solved`: whether the Legendre transform was inverted, if needed.
     - `projected`: whether the projection onto the constraints has converged.
     - `fixed_positions`, `fixed_velocities`: the combinations of constraints that kept
@@ -367,7 +368,7 @@ def _unreached(
     rows = [a for a, x in enumerate(left) if abs(x) > allowed[a] / fixed.sizes[a]]
     if not rows:
         return f"{missed}{_or_keep_fewer(kept)}"
-    # Each column is the change of these violations along one kept component.
+    # Each column is the change of this part along one kept component.
     released = fixed.projector @ fixed.slopes
     small = float(np.finfo(left.dtype).eps) ** 0.5
     largest = np.max(np.abs(left))

@@ -362,9 +362,10 @@ def _ranks_judged(
 ) -> tuple[list[BoolScalar], FloatScalar]:
     """Return which ranks are deficient, and the reciprocal condition number of C.
 
-    Redundant constraints are compatible if C has the rank of their derivatives. For
-    redundant constraints, the second result is one if they are compatible and zero
-    otherwise, and a rank is deficient only if all derivatives of a constraint are zero.
+    C is the compatibility matrix. Redundant constraints are compatible if C has the
+    same rank as their derivatives. For redundant constraints, the second result is one
+    if they are compatible and zero otherwise, and a rank is deficient only if all
+    derivatives of a constraint are zero.
     """
     jacobian, reaction, _ = lin.dense
     delassus = jacobian @ reaction

@@ -225,8 +225,8 @@ Vector = Float[Array, " n"]
 class Fixed(NamedTuple):
     """The combinations of constraints that the kept components determine.
 
-    Each constraint is divided by its largest absolute derivative. The rows of
-    `projector` and `slopes` belong to the constraints.
+    Row i of `projector` and `slopes` belongs to constraint i, divided by its largest
+    absolute derivative.
 
     - `sizes`: the largest absolute derivative of each constraint, 1 if all are zero.
     - `projector`: the projector onto the combinations that are constant, to first

@@ -29,10 +29,11 @@ class Checkpoint(eqx.Module):
     """All data that a later run needs to continue an earlier run bit for bit.
 
     A `State` is not enough for this. The run adds up q and p by compensated sums, and
-    also carries the rounding errors of these sums. The times t_k = t0 + k dt depend on
-    their origin t0. Each step uses the linearised equations of motion that the previous
-    step computed at its end. `SaveAt(checkpoint=True)` saves a checkpoint, `integrate`
-    accepts a checkpoint in place of a state, and `nhjax.save` writes it to a file.
+    also carries the rounding errors of these sums. It counts its times t_k = t0 + k dt
+    from the start t0 of the first run. Each step uses the linearised equations of
+    motion that the previous step computed at its end. `SaveAt(checkpoint=True)` saves a
+    checkpoint, `integrate` accepts a checkpoint in place of a state, and `nhjax.save`
+    writes it to a file.
 
     - `state`: the last state of the run; if the run failed, the last good state.
     - `q_compensation`, `p_compensation`: the rounding errors of the sums q and p.
@@ -220,8 +221,8 @@ def _agree(old: Linearisation, new: Linearisation) -> BoolScalar:
         )
     ]
     # The bound is far above eps, because an ill-conditioned inverse has few correct
-    # digits. If the matrices differ by less, the stage solver converges as well with
-    # the Jacobian of the checkpoint as with a fresh Jacobian.
+    # digits. If the differences are below the bound, the stage solver converges as well
+    # with the Jacobian of the checkpoint as with a fresh Jacobian.
     small = float(jnp.finfo(pairs[0][0].dtype).eps) ** 0.25
     close = [max_norm(x - y) <= small * (max_norm(x) + max_norm(y)) for x, y in pairs]
     return jnp.all(jnp.stack(close))

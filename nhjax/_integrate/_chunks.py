@@ -60,8 +60,8 @@ class Output(NamedTuple):
 
     - `last`: the result of the last chunk.
     - `saved`: the saved rows, along a leading axis, or None.
-    - `records`: the records of all steps, or of the steps in the argument `recorded` of
-        `drive`; None if no records are kept.
+    - `records`: the data for interpolation of all steps, or of the steps in the
+        argument `recorded` of `drive`; None if no records are kept.
     - `num_steps`: the number of steps for which there are rows.
     - `is_interrupted`: whether Ctrl-C ended the run before its last step.
     """
@@ -101,8 +101,8 @@ def drive(
 
     - `chunk`: the function that takes a chunk of steps, called with the carry, the log
         and the numbers of a `Span`. Its result has the fields `carry`, `log`,
-        `num_filled`, `saved` and `records`.
-    - `carry`, `log`: the carry and the log before the first iteration.
+        `num_filled` (the number of steps with rows so far), `saved` and `records`.
+    - `carry`, `log`: the loop carry and the event log before the first iteration.
     - `num_steps`, `num_iterations`: the numbers of steps and of iterations of the run.
     - `stride`, `room`: the stride of the output, and the number of rows of the buffers.
     - `saves_end`: a function that returns whether a run of a given number of steps

@@ -39,7 +39,7 @@ _SAMPLES, _SPREAD = 3, 0.3
 # The number of Newton iterations that move these states onto the constraints on
 # velocities. These constraints may be nonlinear.
 _ITERATIONS = 5
-# If a rate of change is below this many units of round-off per step, it is ignored.
+# A rate of change below this many units of round-off per step counts as zero.
 _UNITS = 1e3
 
 
@@ -87,9 +87,9 @@ def _noise_and_least_part(
         system.manifold_of(q),
         *(t, q, u, dt, value),
     )
-    # The mass matrix is tested only at the initial state. It stays definite or
-    # indefinite along the motion, because an eigenvalue that changes its sign makes the
-    # matrix singular, which ends the run.
+    # Whether the mass matrix is definite is tested only at the initial state. It stays
+    # definite or indefinite along the motion, because an eigenvalue that changes its
+    # sign makes the matrix singular, which ends the run.
     t, q, u = stop_gradient((t, q, u))
     hessian = square_jacobian(lambda u: system.fibre_derivative(t, q, u, args), u)
     return noise, jnp.where(hessian.is_definite(), 0, LEAST_PART).astype(value.dtype)
@@ -145,7 +145,7 @@ def _require_conserved_energy(
 
 
 def _depends_on_time(function: Callable[..., Any], t: FloatScalar, *rest: Any) -> bool:
-    """Return whether the program of a function uses its first argument."""
+    """Return whether the program of a function uses its first argument, the time."""
     time = jnp.reshape(t, (1,))
     found = jacobian_sparsity(lambda t: jnp.atleast_1d(function(t[0], *rest)), time)
     return bool(np.any(found))
@@ -159,13 +159,14 @@ def conserves(
     y: State,
     args: Args,
 ) -> BoolScalar:
-    """Return whether the rate of change of invariants is zero, at a state and near it.
+    """Return whether the invariants are constant along the motion, at y and near y.
 
-    The rate is also computed at some states near y: random displacements of y, moved
-    onto the constraints on velocities. States that still violate these constraints are
-    ignored, and so are states at which the equations of motion have no solution. With
-    holonomic constraints, only the velocity is displaced, because displaced positions
-    and times may violate the constraints.
+    Their rate of change is computed at y and at some states near y: random
+    displacements of y at times up to three steps later, moved onto the constraints on
+    velocities. States that still violate these constraints are ignored, and so are
+    states at which the equations of motion have no solution. With holonomic
+    constraints, only the fibre coordinate (v or p) is displaced, because displaced
+    positions and times may violate the constraints.
     """
     u0, manifold = system.fibre_coordinate(y), system.manifold_of(y.q)
     numbers = np.random.default_rng(0).standard_normal((2, _SAMPLES, u0.shape[0]))

@@ -135,7 +135,7 @@ def _batch_dims(number: int) -> tuple[str, ...]:
 
 
 def _time(ts: np.ndarray, batch: tuple[str, ...]) -> dict[str, Any]:
-    """Label the time axis by common times, or name the times `t` if they differ."""
+    """Return labels of the time axis, or an array `t` if members differ in times."""
     flat = ts.reshape(-1, ts.shape[-1])
     if flat.shape[0] and np.all(flat == flat[:1]):
         return {"time": ("time", flat[0])}

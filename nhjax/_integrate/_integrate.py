@@ -175,7 +175,7 @@ def integrate(
     - `method`: the method, such as `nhjax.LobattoIIIAB(stages=3)`. `nhjax.Gauss`
         supports only systems without constraints.
     - `y0`: a consistent state, from `nhjax.initial_state` or an earlier `Solution`.
-        Only methods with the propagated closure use the multiplier of this state. `y0`
+        Only methods with `closure="propagated"` use the multiplier of this state. `y0`
         may also be the `Checkpoint` of an earlier run, which then continues bit for
         bit.
     - `dt`: the step size, a scalar, in units of time; negative to integrate backwards.
@@ -225,8 +225,8 @@ def integrate(
     message is in a `JaxRuntimeError` or `ValueError`); `ShapeError`, `DTypeError`,
     `NonFiniteError`, `TypeError` and `ValueError` for invalid arguments;
     `DependentConstraintsError` with the names of constraints that depend on each other
-    in `y0`; a `ValueError` that names the failing hypothesis (H1, H2, H3) if the method
-    cannot integrate constrained systems.
+    in `y0`; a `ValueError` that names the paper's failing hypothesis (H1, H2 or H3) if
+    the method cannot integrate constrained systems.
 
     !!! note
 
@@ -330,7 +330,8 @@ def integrate(
         try:
             sol = whole_run(system, method, y0, grid, args, options, saveat, again)
         except ForceSlopeError:
-            # Newton's method needs the same derivatives, and would fail too.
+            # A force lacks a derivative that the full Jacobian needs. Newton's method
+            # needs it too.
             used_newton = True
             break
     if valid is not None:

@@ -61,9 +61,9 @@ class Loop(eqx.Module):
     def _report(self, k: Int[Array, ""]) -> None:
         """Report the steps that are certain to be complete after iteration k.
 
-        A stepper may need more iterations than there are steps. The report counts the
-        surplus iterations as the first ones, so that all members of a batch report the
-        same number of steps, and the meter is called once for all members.
+        A stepper may need more iterations than there are steps. The report subtracts
+        this surplus from k. All members of a batch then report the same number of
+        steps, and the meter is called once for all members.
         """
         length = static_length(self.stepper.plain.num_steps)
         surplus = static_length(self.num_iterations) - length
@@ -105,13 +105,13 @@ class Loop(eqx.Module):
     def moving(self, carry: AbstractCarry) -> AbstractCarry:
         """Return the same carry; in a differentiated run, its state has tangents.
 
-        With these tangents, which may be zero, JAX traces the body of the loop once.
+        With these tangents, which may be zero, JAX traces the loop's body only once.
         """
         state = with_zero_tangents(carry.step_state.state, self.stepper)
         return eqx.tree_at(lambda x: x.step_state.state, carry, state)
 
     def no_rows(self, carry: AbstractCarry) -> Rows:
-        """Return rows of zeros; after the end, `write` puts them into the extra row."""
+        """Return rows of zeros, which `write` puts into an extra row of the buffers."""
         rows = jax.tree.map(
             lambda x: jnp.zeros(x.shape, x.dtype), self.row_shapes(carry)
         )
@@ -220,7 +220,7 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
     The steps are divided into `checkpoints` blocks, and each block is divided in the
     same way, until a block has at most `checkpoints` steps. The reverse pass works in
     one block of each level at a time. For this block it stores the states at the starts
-    of the smaller blocks in it. In a block of the last level, it stores the stages of
+    of the smaller blocks in it. In one of the smallest blocks, it stores the stages of
     all steps. The default is two levels. Each level beyond the first costs another
     forward run. With L levels and num_steps = checkpoints^L the memory is
     O(L checkpoints).

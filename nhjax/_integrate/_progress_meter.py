@@ -67,8 +67,8 @@ class AbstractProgressMeter(eqx.Module):
     def report_part(self, before: FloatScalar, after: FloatScalar) -> None:
         """Report from inside a traced loop the percentage done, if it has increased.
 
-        `before` and `after` are the parts that are done before and after a step, from 0
-        to 1. For a batch, the part of its slowest member is reported.
+        `before` and `after` are the parts of the run that are done before and after a
+        step, from 0 to 1. For a batch, the part of its slowest member is reported.
         """
         if self.silent:
             return

@@ -31,8 +31,8 @@ class ReversibleAdjoint(AbstractAdjoint):
     attracts the motion, as for a sleigh, it repels the motion in reversed time, and
     these differences grow as fast as the motion approached the set. In that case prefer
     `RecursiveCheckpointAdjoint`. This adjoint allows only reverse mode and forward over
-    reverse mode: `jax.jvp` needs one of the other two adjoints. Gradients are also
-    available if `num_steps` is an array.
+    reverse mode: `jax.jvp` needs `DirectAdjoint` or `RecursiveCheckpointAdjoint`.
+    Gradients are also available if `num_steps` is an array.
 
     !!! example
 
@@ -64,7 +64,7 @@ def _run_fwd(perturbed, arguments):
     # `_run` is not called here: it has a custom rule for reverse mode, which forward
     # mode cannot differentiate.
     carry, rows = DirectAdjoint().run(*arguments)
-    # Of the rows, the backward pass needs only the log, and the shapes of the others.
+    # The backward pass needs the log and, of all other rows, only the shapes.
     shapes = jax.eval_shape(lambda: rows)
     return (carry, rows), (carry, shapes, rows.log)
 
@@ -133,9 +133,9 @@ def _if_retraced(
 ) -> PyTree[Array]:
     """Return the gradient, or NaN if the run failed or could not be retraced.
 
-    A run counts as retraced if the state that was `reached` agrees with the state at
-    the `start` of the run. If all cotangents are zero, the gradient is zero in any
-    case.
+    A run counts as retraced if the backward pass has `reached` a state that agrees with
+    the state at the `start` of the run. If all cotangents are zero, the gradient is
+    zero in any case.
     """
     manifold = system.manifold_of(start.q)
     xi = manifold.local(manifold.compose(manifold.inverse(start.q), reached.q))

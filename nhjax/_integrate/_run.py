@@ -191,7 +191,7 @@ def _stepper(
     t0, fn = grid.t0, options.fn
     dt, num_steps = grid.typical_size, grid.num_steps
     if isinstance(grid, VariableGrid):
-        # Times of variable steps are not multiples of a size: the origin is only t0.
+        # The times of variable steps are not t0 + k dt, so the origin is only t0.
         num_steps = grid.most_steps
         origin = Origin(t0, jnp.zeros((), jnp.int32), jnp.zeros_like(t0))
         state = y0.state if isinstance(y0, Checkpoint) else y0
@@ -346,9 +346,9 @@ def _chunk(
     loop = Loop(stepper, saving, NoProgressMeter())
 
     def steps(loop: Loop, carry: AbstractCarry, log: Any, start: Any, end: Any):
-        # Entries of the linearisation that are constants of the program in the first
-        # step are constant in all steps, and the compiler uses the constants. To find
-        # them, the matrices are traced at the present state, but are not computed.
+        # Some entries of the linearisation are constants of the program, which the
+        # compiler can use in all steps. To find these entries, the linearisation is
+        # traced here. Its values are not computed again, but come from the carry.
         plain, state = loop.stepper.plain, carry.step_state.state
         u = plain.system.fibre_coordinate(state)
         given = plain.system, plain.time(0), state.q, u, plain.args
@@ -432,7 +432,7 @@ def _samples(
     stage_solver: AbstractStageSolver,
     samples: tuple[Float[Array, " k"], Int[Array, " k"], StepRecord],
 ) -> PyTree[Array]:
-    """Compute the output at times inside steps with given indices and records."""
+    """Compute the output at times, from the indices and records of their steps."""
     none = jnp.zeros((), jnp.int32)
     grid = grid.of_length(none)
     stepper, fn = _stepper(system, method, y0, grid, args, options, stage_solver)
@@ -538,8 +538,8 @@ def _steps_taken(
 ) -> tuple[SaveAt, np.ndarray]:
     """Find, after the run, the steps in which the times of `SaveAt(ts=...)` lie.
 
-    Return options that contain only the times that were reached, and the indices of the
-    steps.
+    Return `saveat` with only the times that were reached, and the indices of the steps
+    that contain these times.
     """
     ts = np.asarray(saveat.ts)
     if records is None or records.interval is None or not len(records.force):

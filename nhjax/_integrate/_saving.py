@@ -34,7 +34,7 @@ class SaveAt(eqx.Module):
     - `t0`: save the initial state.
     - `t1`: save the final state.
     - `ts`: save at these times, by evaluating the collocation polynomials. The times
-        must be sorted in the direction of time.
+        must not decrease; in a run backward in time, they must not increase.
     - `steps`: save after every step (True), or after every k-th step (an int k). With
         `t1=True` the final state is saved too, unless it is one of these states.
     - `dense`: save the collocation polynomials for `Solution.evaluate`.
@@ -253,7 +253,7 @@ class RecordPlaces(NamedTuple):
 def record_places(
     dense: bool, sampled: Int[Array, " k"] | None, num_steps: int | Int[Array, ""]
 ) -> RecordPlaces:
-    """Find the places of the records for dense output or for the sampled steps."""
+    """Find the places of the records for dense output or for the steps in `sampled`."""
     if not dense and sampled is None:
         return RecordPlaces(0, None)
     length = static_length(num_steps)

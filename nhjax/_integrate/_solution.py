@@ -67,15 +67,16 @@ class Solution(eqx.Module):
         any, the reactions are not unique),
         `max_residual` (the largest residual of the stage equations, relative to the
         momenta),
-        `max_constraint_violation` (the largest |Φ| at the nodes, including the initial
-        state),
-        `max_multiplier_defect` (the largest |Λ^s - λ_c|, the distance of the last stage
-        multiplier of a step from the continuous multiplier),
+        `max_constraint_violation` (the largest |Φ|, |Γ| or |dΓ/dt| at the initial state
+        and at the ends of the steps),
+        `max_multiplier_defect` (the largest |Λ^s - λ_c|, where Λ^s is the last stage
+        multiplier of a step, and λ_c the multiplier of the continuous equations at the
+        end of the step),
         `max_invariant_error` (only with `invariants`: the largest |I - I_0| of a
         conserved function, relative to the size of its terms),
         `max_error_estimate` (the largest estimated error of a step, relative to the
         change of the state in the step; a value of 1 means that the step is entirely
-        wrong; missing for methods with one node),
+        wrong; missing if all stages of the method are at one time),
         `failed_step` (the index of the step that failed, -1 for none), and
         `worst_coordinate` (the index of the coordinate whose momentum equations had
         the largest residual, or a residual that is not a number, in the step that
@@ -119,11 +120,11 @@ class Solution(eqx.Module):
         the momentum p(t) is the mixed polynomial (there v(t)) of its Proposition on
         continuous approximation. The velocity v(t) follows from p(t) by the Legendre
         transform.
-        The multiplier λ(t) is the continuous multiplier at that state; with the
+        λ(t) is the multiplier of the continuous equations at that state; with the
         propagated closure it is the polynomial through the stage multipliers Λ^i.
         At the ends of the steps the result is the state that `integrate` computed.
-        Inside a step the error is O(h^s) in q, v and p. If no force depends on the
-        velocity, the error in p and v is O(h^{s+1}).
+        With s stages, the error inside a step is O(h^s) in q, v and p. If no force
+        depends on the velocity, the error in p and v is O(h^{s+1}).
 
         **Arguments:**
 

@@ -188,7 +188,7 @@ class ConstantStepSize(AbstractStepSizeController):
     def init(
         self, context: StepContext, t: FloatScalar, start: StepState
     ) -> tuple[FloatScalar, Memory, RESULTS]:
-        """Return `dt` in the direction of the run."""
+        """Return |dt|, with a minus sign for a run backward in time."""
         del t, start
         return _size_of_user(context), (), RESULTS.successful
 
@@ -204,7 +204,7 @@ class ConstantStepSize(AbstractStepSizeController):
         return _size_of_user(context), memory
 
     def given_size(self, context: StepContext, node: Int[Array, ""]) -> FloatScalar:
-        """Return `dt` with the sign of the direction of the run."""
+        """Return |dt|, with a minus sign for a run backward in time."""
         del node
         return _size_of_user(context)
 
@@ -240,7 +240,7 @@ class GivenStepSizes(AbstractStepSizeController):
         return self.sizes[0], memory
 
     def given_size(self, context: StepContext, node: Int[Array, ""]) -> FloatScalar:
-        """Return the size of the step after a node."""
+        """Return the size of the step with the index `node`."""
         del context
         return self.sizes[jnp.minimum(node, self.sizes.shape[0] - 1)]
 
@@ -483,8 +483,9 @@ class PIDController(AbstractStepSizeController):
             jnp.asarray(x, dtype) for x in (self.factormin, self.factormax, self.safety)
         )
         estimate = jnp.where(is_known, error, jnp.inf)
-        # Sums of logarithms take less time than products of powers. Logarithms
-        # below `bound` are raised to it: it already gives the largest factor.
+        # Sums of logarithms take less time than products of powers. The logarithm of
+        # the error is raised to at least `bound`, which already gives the largest
+        # factor.
         bound = number * jnp.log(safety / most)
         error = jnp.log(jnp.maximum(error, float(jnp.finfo(dtype).tiny)))
         error = jnp.maximum(error, bound)
@@ -504,7 +505,7 @@ class PIDController(AbstractStepSizeController):
         factor = jnp.where(is_known, factor, least)
         following = self._limited(size * factor)
         # If a step was shorter than the chosen size, its error says little about the
-        # next step, and must not make it smaller than the chosen size.
+        # next step, which must not become smaller than the chosen size.
         chosen = jax.lax.stop_gradient(jnp.abs(attempt.chosen))
         is_shorter = size < (1 - 1e-9) * chosen
         kept = jnp.maximum(following, chosen)
@@ -676,7 +677,7 @@ class ReversibleController(AbstractStepSizeController):
     def _size(
         self, context: StepContext, density: FloatScalar, rate: FloatScalar
     ) -> FloatScalar:
-        """Compute the size of the step after a node, from ρ and G at the node."""
+        """Compute the size of a step from ρ and G at its start."""
         eps = jnp.asarray(self.eps, density.dtype) * context.direction
         return eps / (density + 0.5 * eps * rate)
 
@@ -708,8 +709,8 @@ class ReversibleController(AbstractStepSizeController):
         end = attempt.t + attempt.h
         _, following = self._density(context, end, attempt.outcome.step_state)
         eps = jnp.asarray(self.eps, density.dtype) * context.direction
-        # A shorter step of size h counts as a step with the smaller ε that solves
-        # h = ε / (ρ + ε G / 2).
+        # A step that was shortened to the size h counts as a step with the smaller ε
+        # that solves h = ε / (ρ + ε G / 2).
         h = jax.lax.stop_gradient(attempt.h)
         part = jnp.where(attempt.is_whole, eps, h * density / (1 - 0.5 * h * rate))
         moved = (density + 0.5 * part * rate) + 0.5 * part * following
@@ -722,7 +723,7 @@ class ReversibleController(AbstractStepSizeController):
     def resume(
         self, context: StepContext, size: FloatScalar, memory: Memory
     ) -> tuple[FloatScalar, Memory]:
-        """Return the size of the step after the node, in the direction of this run."""
+        """Return the size of the next step, negative for a run backward in time."""
         del size
         density, rate = memory
         return self._size(context, density, rate), memory

@@ -63,9 +63,9 @@ class StepResult(NamedTuple):
     - `is_good`: whether a step was taken and solved.
     - `row`: the index of the output row that the iteration fills; the number of steps
         if it fills no row; None if iteration k always fills row k.
-    - `log_entry`, `log_slot`: an entry for the log of the stepper, and its index in the
-        log. Without an entry the index is the length of the log. Both are None for a
-        stepper without a log.
+    - `log_entry`, `log_slot`: an entry for the log of the stepper, from which a reverse
+        replay finds the iterations again, and its index in the log. Without an entry
+        the index is the length of the log. Both are None for a stepper without a log.
     """
 
     t: FloatScalar
@@ -230,7 +230,7 @@ class PlainCarry(AbstractCarry):
 
 
 class PlainStepper(AbstractStepper[PlainCarry, None]):
-    """One step of the method per iteration, from node to node.
+    """One step of the method per iteration, from the time t_k to t_{k+1}.
 
     - `args`: the `args` of the run; the loop, the output and the events read it here.
     - `programs`: the traced program of a step, shared by all derivatives of the run.
@@ -378,7 +378,7 @@ class PlainStepper(AbstractStepper[PlainCarry, None]):
     def finish(
         self, carry: PlainCarry, rows: Rows, log: None, given: Any
     ) -> RunEnd[Rows, None]:
-        """Return the end of the run, at the last node."""
+        """Return the end of the run, at the end of the last step."""
         del log
         t1 = self.time(self.num_steps)
         found = carry.step_state.state, rows

@@ -99,7 +99,8 @@ class StepSizes(eqx.Module):
     ) -> tuple[Clock, RESULTS]:
         """Return the clock before the first step, and whether the run can start.
 
-        If a checkpoint has the data of such a controller, the run continues with them.
+        If `y0` is a checkpoint with data that fit this controller, the run continues
+        with them.
         """
         t, context = plain.time(0), self.context(plain)
         size, memory, result = self.controller.init(context, t, start)
@@ -334,13 +335,13 @@ class VariableStepper(AbstractStepper[VariableCarry, StepLogEntry]):
         return RunEnd(state, t1, rows, None)
 
     def differentiable(self, carry: VariableCarry) -> tuple[State, FloatScalar]:
-        """Return the state and the time, or their cotangents."""
+        """Return the state and the time of a carry, or of its cotangent."""
         return carry.step_state.state, carry.clock.t
 
     def reverse_replay(
         self, start: VariableCarry, end: VariableCarry, log: StepLogEntry | None
     ) -> "VariableReverseReplay":
-        """Return the replay of a run, with the steps in its log."""
+        """Return the replay of a run from its end, with the steps in its log."""
         assert log is not None
         return VariableReverseReplay(self, start, end, log)
 
@@ -401,7 +402,7 @@ def statistics_of_attempt(
 
 
 class VariableReverseReplay(AbstractReverseReplay[VariableCarry, StepLogEntry]):
-    """The replay of a run whose log has the starts and the sizes of its steps."""
+    """The replay of a run from its end, with a log of the starts and sizes of steps."""
 
     stepper: VariableStepper
     start: VariableCarry

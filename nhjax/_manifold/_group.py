@@ -122,7 +122,7 @@ class AbstractLieGroup(eqx.Module):
     def advance(
         self, q: Element, xi: Vector, compensation: Element
     ) -> tuple[Element, Element]:
-        """Compute g τ(ξ) and the compensation, the accumulated rounding error.
+        """Compute q τ(ξ) and the compensation, the accumulated rounding error.
 
         The next call adds the compensation, so that rounding errors do not grow over
         many steps. A group without compensated summation returns the compensation
@@ -133,7 +133,7 @@ class AbstractLieGroup(eqx.Module):
     def advance_across(
         self, q: Element, xi: Vector, compensation: Element
     ) -> tuple[Element, Element]:
-        """Compute g τ(-ξ)⁻¹ τ(ξ), from -ξ to ξ in the chart, and its compensation."""
+        """Compute q τ(-ξ)⁻¹ τ(ξ), from -ξ to ξ in the chart, and its compensation."""
         return self.advance(self.act_back(q, -xi), xi, compensation)
 
     def tangent(self, g: Element, eta: Vector) -> Element:
@@ -141,7 +141,7 @@ class AbstractLieGroup(eqx.Module):
         return _jvp(lambda z: self.act(g, z), jnp.zeros_like(eta), eta)
 
     def left_gradient(self, function: Callable[[Element], Array], q: Element) -> Vector:
-        """Compute L_g^* D f(g), the gradient of ξ -> f(g τ(ξ)) at ξ = 0."""
+        """Compute L_q^* D f(q), the gradient of ξ -> f(q τ(ξ)) at ξ = 0."""
         zero = jnp.zeros(self.dim, _dtype(q))
         return transpose(lambda eta: self.tangent(q, eta), zero)(jax.grad(function)(q))
 
@@ -246,7 +246,7 @@ class AbstractMotionGroup(AbstractLieGroup):
     def advance_across(
         self, q: Element, xi: Vector, compensation: Element
     ) -> tuple[Element, Element]:
-        """Compute g τ(ξ) τ(ξ), which equals g τ(-ξ)⁻¹ τ(ξ)."""
+        """Compute q τ(ξ) τ(ξ), which equals q τ(-ξ)⁻¹ τ(ξ)."""
         middle, compensation = self.advance(q, xi, compensation)
         return self.advance(middle, xi, compensation)
 

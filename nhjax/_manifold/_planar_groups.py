@@ -347,7 +347,7 @@ def is_framed(q: Any) -> bool:
 def unframed(q: PyTree[Array]) -> PyTree[Array]:
     """Return an element with its framed poses replaced by plain poses.
 
-    The functions of a user are called with plain elements.
+    The user's functions are called with plain elements.
     """
     return jax.tree.map(lambda x: x.pose if is_framed(x) else x, q, is_leaf=is_framed)
 

@@ -1,4 +1,4 @@
-"""The vector space R^n and the groups of space, SO(3) and SE(3), by unit quaternions.
+"""The vector space R^n, and the groups SO(3) and SE(3), by unit quaternions.
 
 Quaternions (w, x, y, z) are multiplied by bilinear maps with constant coefficients.
 Most of these coefficients are zero. Multiplying by the zeros costs less than slicing
@@ -154,10 +154,10 @@ class Euclidean(AbstractLieGroup):
 class SO3(AbstractMotionGroup):
     """The group SO(3) of rotations of space. An element is a unit quaternion.
 
-    The quaternion is the paper's g = (w, x, y, z). The velocity is the body angular
-    velocity ω, with dq/dt = q ∘ (0, ω/2). The matrix `matrix(q)` takes body coordinates
-    to space coordinates. The quaternions q and -q are the same rotation. `local`
-    returns the same vector for both: the shorter of the two possible vectors.
+    The quaternion is q = (w, x, y, z). The velocity is the body angular velocity ω,
+    with dq/dt = q ∘ (0, ω/2). The matrix `matrix(q)` takes body coordinates to space
+    coordinates. The quaternions q and -q are the same rotation. `local` returns the
+    same vector for both: the shorter of the two possible vectors.
 
     **Arguments:**
 
@@ -420,7 +420,7 @@ class SE3(AbstractMotionGroup):
         return jnp.concatenate([y + 0.5 * cross(xi[3:], y), sigma])
 
     def Ad(self, g: Pose, eta: Twist) -> Twist:
-        """Compute Ad_g η = (R u + x × R σ, R σ) for η = (u, σ)."""
+        """Compute Ad_g η = (R u + x × R σ, R σ) for g = (R, x), η = (u, σ)."""
         sigma = rotate(g[:4], eta[3:])
         u = rotate(g[:4], eta[:3]) + cross(g[4:], sigma)
         return jnp.concatenate([u, sigma])

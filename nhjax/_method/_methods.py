@@ -1,13 +1,14 @@
 """The methods: Lobatto IIIA-IIIB, Gauss, and partitioned methods from any tableau.
 
-A step has s multipliers Λ^1, ..., Λ^s per constraint. The constraint at stage 1 holds
-by hypothesis H1, which leaves s - 1 equations per constraint. A multiplier closure
-writes the multipliers in terms of s - 1 unknowns y, and of multipliers λ_k and λ_{k+1}
-at the ends of the step,
+A step has s multipliers Λ^1, ..., Λ^s per constraint. By hypothesis H1, stage 1 is the
+state at t_k, where the constraint holds already. This leaves s - 1 equations per
+constraint. A multiplier closure writes the multipliers in terms of s - 1 unknowns y,
+and of multipliers λ_k and λ_{k+1} at the ends of the step, with constant weights,
 
     (Λ^1, ..., Λ^s) = start λ_k + end λ_{k+1} + E y.
 
-With A = (a_ij), the leading part of the constraints' linearisation is then A_{2:,:} E.
+With A = (a_ij), the derivative of the constraints with respect to h y is then, for
+small h, A_{2:,:} E times the compatibility matrix C.
 """
 
 import abc
@@ -70,7 +71,8 @@ class ClosureWeights:
 
     - `E`: shape (s, s-1), the weights of the unknowns y.
     - `start`: shape (s,), the weights of the multiplier λ_k at t_k.
-    - `end`: shape (s,), the weights of the continuous multiplier λ_c(q_{k+1}, p_{k+1}).
+    - `end`: shape (s,), the weights of λ_{k+1} = λ_c(q_{k+1}, p_{k+1}), the continuous
+        multiplier.
     - `response`: shape (s-1,), the change of y that compensates a change of λ_{k+1} by
         one, so that the sums Σ_j a_ij Λ^j with i >= 2 stay the same.
     - `stage_response`: shape (s,), the change of Σ_j â_ij Λ^j if λ_{k+1} changes by one
@@ -126,7 +128,10 @@ class AbstractMethod(eqx.Module):
 
     @property
     def orders(self) -> SimplifyingAssumptions:
-        """Find the simplifying assumptions B(p), C(q), D(r) and CĈ(Q) that hold."""
+        """Find the simplifying assumptions B(p), C(q), D(r) and CĈ(Q) that hold.
+
+        `_order_conditions` defines these conditions.
+        """
         return _order_conditions.simplifying_assumptions(self._tableau())
 
     @property
@@ -172,13 +177,13 @@ class AbstractMethod(eqx.Module):
     def multiplier_order(self) -> int:
         """Return the order of convergence of the multiplier that a solution reports.
 
-        With `closure="propagated"` this order is the smaller of q in C(q) and Q in
-        CĈ(Q). One is subtracted if R_A(∞) = 1. The result is then rounded up to an even
-        number if the method is symmetric, and limited to `constrained_order`. Runs with
-        many tableaux confirm this rule. (The paper's theorem on global convergence has
-        q in place of the smaller of q and Q, which is the same for Lobatto's nodes.)
-        With the other closures the multiplier is the continuous multiplier, which has
-        the order of the state.
+        With `closure="propagated"` this order is min(q, Q) with the largest q and Q for
+        which C(q) and CĈ(Q) hold. One is subtracted if R_A(∞) = 1. The result is then
+        rounded up to an even number if the method is symmetric, and limited to
+        `constrained_order`. Runs with many tableaux confirm this rule. (The paper's
+        theorem on global convergence has q in place of min(q, Q), which is the same for
+        Lobatto's nodes.) With the other closures the multiplier is the continuous
+        multiplier, which has the order of the state.
 
         **Raises:** `ValueError`, as `require_constraint_hypotheses` does.
         """
@@ -325,12 +330,13 @@ class LobattoIIIAB(AbstractMethod):
 
         - `stages`: s from 2 to 32. More stages gain no accuracy in float64, and their
             coefficients take minutes to compute.
-        - `closure`: how a step determines the first of its s multipliers, for which
-            there is no equation. `"propagated"`, the choice of the paper, uses Λ^s of
-            the previous step as Λ^1. `"consistent"` uses the continuous multiplier at
-            the start of the step as Λ^1. `"symmetric"` uses the continuous multipliers
-            at both ends of the step, with one more unknown that makes the step
-            symmetric. With these two closures, a step does not depend on earlier steps.
+        - `closure`: how a step determines Λ^1, the first of its s multipliers, for
+            which there is no equation. `"propagated"`, the choice of the paper, uses
+            Λ^s of the previous step as Λ^1. `"consistent"` uses the continuous
+            multiplier at the start of the step as Λ^1. `"symmetric"` uses the
+            continuous multipliers at both ends of the step, with one more unknown that
+            makes the step symmetric. With `"consistent"` and `"symmetric"`, a step does
+            not depend on earlier steps.
         - `chart`: the origin of the chart of a step on a Lie group. With `"middle"` a
             step with the increment ξ leads from -ξ/2 to ξ/2 in its chart, which
             keeps the symmetry of the method and, without constraints, makes the step

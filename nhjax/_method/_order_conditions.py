@@ -208,7 +208,10 @@ def stability_at_infinity(t: Tableau) -> float:
 
 
 class _Branch(NamedTuple):
-    """A tree τ and the edge to its root: |τ|, γ(τ) and Σ_j a_ij φ_j(τ), with a or â."""
+    """A tree τ that is joined to a new root by an edge of one of the two colours.
+
+    The fields are |τ|, γ(τ) and Σ_j a_ij φ_j(τ), or with â for the other colour.
+    """
 
     size: int
     gamma: int

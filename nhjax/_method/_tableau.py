@@ -61,10 +61,10 @@ class Tableau:
     """A Runge-Kutta tableau (a, b, c) with its symplectic conjugate â.
 
     The fields hold mpmath numbers: `mp_a` is an s x s matrix, `mp_b` and `mp_c` are
-    lists. An identity between them counts as satisfied if its defect is at most
-    `tolerance`, a bound on the round-off: of 60 digits for built-in tableaux, and of
-    float64 for a user's tableau. Instances compare and hash by identity; the functions
-    that create them are cached.
+    lists. An order condition or other identity counts as satisfied if its defect is at
+    most `tolerance`. This is a bound on the round-off of 60 digits for built-in
+    tableaux, and of float64 for a user's tableau. Instances compare and hash by
+    identity; the functions that create them are cached.
     """
 
     mp_a: Matrix
@@ -267,7 +267,7 @@ def lobatto_points(stages: int) -> list[Number]:
 
     def derivative(x: Number) -> tuple[Number, Number]:
         p = legendre(n, x)
-        # P_n' by (1 - x²) P_n' = n (P_{n-1} - x P_n), P_n'' by Legendre's equation.
+        # (1 - x²) P_n' = n (P_{n-1} - x P_n), and P_n'' is from Legendre's equation.
         first = n * (p[n - 1] - x * p[n]) / (1 - x * x)
         return first, (2 * x * first - n * (n + 1) * p[n]) / (1 - x * x)
 

@@ -150,7 +150,8 @@ def _forces(
 ) -> list[Any]:
     """Compute generalised forces for the coordinates from forces for the speeds.
 
-    For velocities v(q, u, q') the force of q is F·(∂v/∂u ∂u/∂q' + ∂v/∂q').
+    A force F at a point of velocity v(q, u, q') has the generalised force
+    F·(∂v/∂u ∂u/∂q' + ∂v/∂q').
     """
     of_speeds = sympy().Matrix(forces_of_loads(loads, speeds, frame))
     directly = sympy().Matrix(forces_of_loads(loads, rates(coordinates), frame))
@@ -323,7 +324,7 @@ def _is_load(pair: Any) -> bool:
 
 
 def forces_of_loads(loads: list[Any], speeds: list[Any], frame: Any) -> list[Any]:
-    """Compute the generalised force Σ F·∂v/∂u of loads for each speed u."""
+    """Compute, for each speed u, the force Σ F·∂v/∂u of loads F with velocities v."""
     module = mechanics()
     if not isinstance(frame, module.ReferenceFrame):
         raise TypeError(

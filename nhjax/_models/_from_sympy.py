@@ -145,11 +145,12 @@ def from_sympy(
         need not be linear in q'.
     - `holonomic`: expressions in q and t that must be zero, or equations.
     - `forces`: generalised forces, as a list with one for each coordinate, or as a
-        dictionary by coordinates or their names. It may also be a list of pairs:
-        (point, force) or (frame, torque), as for `LagrangesMethod`; `frame` is then
-        required.
-    - `parameters`: values of the remaining symbols, by symbol or name. Values that are
-        not given here must be added to `args` at run time.
+        dictionary with coordinates or their names as keys. It may also be a list of
+        pairs: (point, force) or (frame, torque), as for `LagrangesMethod`; `frame` is
+        then required.
+    - `parameters`: a dictionary of values of the remaining symbols, with symbols or
+        names as keys. Values that are not given here must be added to `args` at run
+        time.
     - `frame`: the inertial frame for forces at points and torques on frames.
     - `potential`: the potential energy of a `KanesMethod`. The default is the sum of
         the potential energies of its bodies. The argument is required if bodies have a

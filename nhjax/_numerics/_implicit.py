@@ -27,13 +27,13 @@ from ._floating_point import max_norm, nonzero_or_one
 from ._iteration import dense_increment, iterate, Solved, UpdateNorms
 
 
-# Terms of the Neumann series below this many units of round-off are left out.
+# `solve_contraction` leaves out terms below this many units of round-off.
 _UNITS_LEFT = 256
 # `root` divides its `path` into `_PARTS_OF_PATH` parts, with `_ITERATIONS_OF_PART`
 # iterations in each part.
 _PARTS_OF_PATH, _ITERATIONS_OF_PART = 32, 3
-# If the terms of the series stop falling above this many units of round-off, the series
-# does not converge. The derivative is then NaN rather than a wrong number.
+# If these terms stop falling above this many units of round-off, their sum does not
+# converge. The derivative is then NaN rather than a wrong number.
 _NOISIEST = 1e4
 
 T = TypeVar("T")
@@ -45,7 +45,7 @@ Solution = TypeVar("Solution")
 class AbstractImplicitFunction(eqx.Module, Generic[Arguments, Solution]):
     """A function whose value solves equations, with derivatives from these equations.
 
-    Call an instance with one tree, its arguments. The function is differentiable with
+    Call an instance with one tree of arguments. The function is differentiable with
     respect to its arguments, but not with respect to its own fields. JAX never
     differentiates `solve`: derivatives of every order come from `tangent`.
 
@@ -332,7 +332,7 @@ class ClosureConverted(eqx.Module):
 
 
 def has_tangent(tangents: PyTree[Any]) -> PyTree[bool]:
-    """Return which leaves of a tree of tangents are not None, the symbolic zero."""
+    """Return which leaves of a tree of tangents are not None; None stands for zero."""
     return jax.tree.map(
         lambda leaf: leaf is not None, tangents, is_leaf=lambda leaf: leaf is None
     )

@@ -4,7 +4,7 @@ For matrices of a few rows, calling a library of linear algebra inside a time lo
 too expensive, as it is for products (`_contraction`). All functions here therefore
 consist of elementary operations; only `inverse` calls a library, for matrices with more
 than `LARGEST` rows. Loops keep the program short: its length does not grow with the
-number of blocks, and for most functions not with the number of rows.
+number of blocks of a matrix, and in most functions not with the number of rows.
 """
 
 from collections.abc import Callable
@@ -104,7 +104,7 @@ def compiled_once_inverse(matrix: Float[Array, "m m"]) -> Float[Array, "m m"]:
 
 
 def _sum_of_rows(rows: Float[Array, "k n"]) -> Float[Array, " n"]:
-    # A kernel must not sum more numbers than `LARGEST_REDUCTION` at once.
+    # `nhjax.lanes` must not sum more numbers than `LARGEST_REDUCTION` at once.
     most = max(LARGEST_REDUCTION // rows.shape[1], 1)
     parts = [rows[k : k + most] for k in range(0, rows.shape[0], most)]
     return reduce(jnp.add, [jnp.sum(part, axis=0) for part in parts])

@@ -126,7 +126,7 @@ def iterate(
     The iteration ends
 
     - when an increment is at most `tolerance` times the size of x, or at most the unit
-        round-off times the sizes above;
+        round-off times the size of x (with `round_off`) or times `noise`;
     - when small increments have stopped falling, because they are then round-off;
     - when an increment is not finite, or far larger than the first increment and the
         iterate;

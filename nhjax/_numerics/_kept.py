@@ -39,7 +39,7 @@ _MOST_FUNCTIONS = 32
 
 
 class KeptFunction(eqx.Module):
-    """A traced function as one operation: a tree of the arrays that it closes over.
+    """A traced function, called as one operation; its leaves are arrays that it reads.
 
     Call an instance with trees that have the structure of the example with which the
     function was traced. Leaves that are not arrays always have the values that they
@@ -210,7 +210,7 @@ def _inlined(*operands: Any, jaxpr: Any, kept: _Program) -> list[Any]:
 # In a program that XLA compiles, functions with fewer operations than this are compiled
 # by XLA too: calling native code takes longer than evaluating the function of a
 # textbook system. The number was measured on the gallery's systems that XLA compiles,
-# mainly with 6 to 8 stages.
+# mainly for methods with 6 to 8 stages.
 _XLA_BELOW = 300
 
 

@@ -305,9 +305,10 @@ class WeightedTranspose(AbstractOperator):
 class BlockTridiagonalInverse(AbstractOperator):
     """The inverse of a block tridiagonal matrix, stored as factors of an elimination.
 
-    There are q unknowns and q residuals for each of the l rows of the pattern. Unknowns
-    and residuals are arrays of shape (q, l), or vectors of length q l. Blocks are
-    eliminated from the first to the last. With the diagonal, lower and upper blocks
+    There are q unknowns and q residuals for each of the l rows of the `pattern`, the
+    `SparsityPattern` of B. Unknowns and residuals are arrays of shape (q, l), or
+    vectors of length q l. The N blocks have g = q `pattern.group` unknowns each, and
+    are eliminated from the first to the last. With the diagonal, lower and upper blocks
     D_k, L_k and U_k of block row k, and
 
     P_k = D_k - L_k P_{k-1}⁻¹ U_{k-1},
@@ -349,7 +350,7 @@ class BlockTridiagonalInverse(AbstractOperator):
         return static_take(x[:, :size], np.argsort(pattern.order)).reshape(shape)
 
     def absolute(self) -> AbstractOperator:
-        """Return an operator that estimates products with the matrix |C⁻¹|."""
+        """Return an operator that estimates products with the absolute values."""
         return _EstimatedAbsolute(self)
 
     def as_matrix(self) -> Float[Array, "c c"]:
@@ -382,10 +383,10 @@ class BlockTridiagonalInverse(AbstractOperator):
 class _EstimatedAbsolute(AbstractOperator):
     """An estimate of |C⁻¹|, the absolute values of an inverse, by products with C⁻¹.
 
-    For x >= 0, entry i of |C⁻¹| x is the maximum of entry i of |C⁻¹ y| over all y that
-    differ from x only in the signs of entries. The estimate uses two choices of signs.
-    It is exact for the matrices of a chain of springs or rods: the entries of their
-    inverses have the same sign, or signs that alternate.
+    C⁻¹ is the field `map`. For x >= 0, entry i of |C⁻¹| x is the maximum of entry i of
+    |C⁻¹ y| over all y that differ from x only in the signs of entries. The estimate
+    uses two choices of signs. It is exact for the matrices of a chain of springs or
+    rods: the entries of their inverses have the same sign, or signs that alternate.
     """
 
     map: BlockTridiagonalInverse
@@ -498,15 +499,15 @@ def sparse_jacobian(
 class SparsityPattern:
     """The places of the entries of a sparse matrix B, and derived quantities.
 
-    - `columns`: entry e of row a is in column `columns[e, a]`, shape (w, l); it exists
-        where `present` is true.
+    - `columns`: entry e of row a is in column `columns[e, a]`, shape (w, l), where w is
+        the largest number of entries in a row; it exists where `present` is true.
     - `rows`: entry e of column i has the index `rows[e, i]` in the flattened array of
         (w, l) entries; it exists where `holds` is true.
     - `colours`: the colour of each column, shape (n,). Columns of the same colour have
         no row in common.
     - `order`: an order of the rows in which rows that share columns are near each
-        other. In this order B K Bᵀ is block tridiagonal for a diagonal K, with `group`
-        rows in each block.
+        other. In this order B diag(w) Bᵀ is block tridiagonal for any weights w, with
+        `group` rows in each block.
     """
 
     def __init__(self, entries: Bool[np.ndarray, "l n"]):

@@ -172,9 +172,9 @@ def least_norm_inverse_by_blocks(
 ) -> Float[Array, "l l"]:
     """Compute a generalised inverse of C; the last equations have priority.
 
-    The equations have two parts, and `first` is the number of equations in the first
-    part. If an equation of the first part follows from the second part, its unknown is
-    zero. Otherwise, each of the two parts of x has the least norm, as in
+    The equations C x = b have two parts, and `first` is the number of equations in the
+    first part. If an equation of the first part follows from the second part, its
+    unknown is zero. Otherwise, each of the two parts of x has the least norm, as in
     `least_norm_inverse`. If no equation of one part follows from the other part, the
     result is equal to the result of `least_norm_inverse`.
     """

@@ -807,15 +807,15 @@ class _Rows:
         self.evaluate = jax.jit(self._evaluate)
 
     def _positions(self, q: PyTree[Array], args: Args) -> Array:
-        # Constraints on positions come first. If a constraint on velocities depends on
-        # one of them, the constraint on velocities is therefore left out.
+        # `independent_rows` keeps the first of dependent rows. Constraints on positions
+        # come first, so that a dependent constraint on velocities is left out.
         rows = [x.height(0.0, q, args)[None] for x in self.heights]
         if self.loop is not None:
             rows.append(self.loop(0.0, q, args))
         return jnp.concatenate([jnp.zeros(0), *rows])
 
     def _evaluate(self, q: PyTree[Array], args: Args) -> tuple[Array, Array]:
-        """Compute constraints on positions, and the rates of all per unit velocity."""
+        """Compute constraints on positions, and the Jacobian of rates and slips."""
         space = self.space
 
         def rates(v):

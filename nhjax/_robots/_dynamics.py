@@ -63,7 +63,7 @@ class Mechanics(NamedTuple):
     damping: Float[np.ndarray, "3 n"]
     friction: Float[np.ndarray, " n"]
     friction_smoothing: float
-    # For the scalar joints: the coefficients of x, x² and x³ in the force of the
+    # For the slides and hinges: the coefficients of x, x² and x³ in the force of the
     # spring, and the position at rest.
     stiffness: Float[np.ndarray, "3 s"]
     rest: Float[np.ndarray, " s"]
@@ -168,9 +168,9 @@ class Parameters(eqx.Module):
 def lagrangian_of(mechanics: Mechanics, parameters: Parameters) -> Any:
     """Return the Lagrangian L(t, q, v, args) of a robot.
 
-    The kinetic energy of all bodies between two joints is ½ ξ·M ξ with the body twist
-    ξ = (v, ω) of their frame and their spatial inertia M, which depends only on
-    parameters.
+    Bodies without a joint between them move as one. Their kinetic energy is ½ ξ·M ξ,
+    with the body twist ξ = (v, ω) of their frame and their spatial inertia M, which
+    depends only on parameters.
     """
     space, bodies = mechanics.space, mechanics.bodies
     changing = parameters.names.get("mass", {})
@@ -331,8 +331,8 @@ class Actuators(NamedTuple):
     """The actuators, with one row or entry for each actuator.
 
     The force of an actuator is (g₀ + g₁ l + g₂ l') u + b₀ + b₁ l + b₂ l', with its
-    control u and its length l = moment · q. If an actuator has no limit, the limit is
-    infinite here.
+    control u, gain g, bias b and length l = moment · q. If an actuator has no limit,
+    the limit is infinite here.
     """
 
     names: tuple[str, ...]
@@ -437,7 +437,7 @@ def force_of(
 
 
 class Connection(NamedTuple):
-    """Two frames whose origins coincide, by an equality `connect` or `weld`."""
+    """Two frames whose origins MuJoCo's equality `connect` or `weld` holds together."""
 
     name: str
     first: Frame
@@ -468,7 +468,7 @@ class Loops(NamedTuple):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the equations, in order."""
+        """The names of the constraint equations, in order."""
         points = [
             f"{loop.name} {x}"
             for loop in (*self.connections, *self.welds)
@@ -506,8 +506,8 @@ def loops_of(
             if loops.welds:
                 a, b = (x[len(loops.connections) :] for x in jnp.split(rotation, 2))
                 relative = jnp.einsum("nji,njk->nik", b, a)
-                # The antisymmetric part of a rotation is its axis times the sine of its
-                # angle.
+                # The antisymmetric part of a rotation matrix is the cross matrix of its
+                # axis times the sine of its angle.
                 part = relative - jnp.swapaxes(relative, 1, 2)
                 turn = jnp.stack([part[:, 2, 1], part[:, 0, 2], part[:, 1, 0]], axis=1)
                 rows.append(0.5 * turn.ravel())

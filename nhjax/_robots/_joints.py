@@ -48,7 +48,7 @@ class Joint(NamedTuple):
 
 
 def twists(joints: Sequence[Joint]) -> Float[np.ndarray, "n 6"]:
-    """Return the twists of scalar joints with unit rate, in their own frames."""
+    """Return the twists of slides and hinges at unit rate, in their own frames."""
     found = np.zeros((len(joints), 6))
     for row, joint in zip(found, joints, strict=True):
         if joint.kind == "slide":
@@ -61,9 +61,10 @@ def twists(joints: Sequence[Joint]) -> Float[np.ndarray, "n 6"]:
 def motions(joints: Sequence[Joint]) -> Float[np.ndarray, "4 n 12"]:
     """Return the coefficients of 1, sin s, 1 - cos s and s in the pose of each joint.
 
-    Here s is the angle or the displacement of the joint. A hinge turns about its axis
-    by Rodrigues' formula I + sin s â + (1 - cos s) â², and its anchor p stays in place.
-    Each row has the rotation and then the position.
+    Here s is the angle or the displacement of the joint. The joints are slides and
+    hinges. A hinge turns about its axis a by Rodrigues' formula
+    I + sin s â + (1 - cos s) â² with â x = a × x, and its anchor stays in place. The 12
+    numbers are the entries of the rotation matrix, then the position.
     """
     found = np.zeros((4, len(joints), 12))
     for number, joint in enumerate(joints):

@@ -42,9 +42,9 @@ class Robot(eqx.Module):
     """A robot that `from_mujoco` has read from a model.
 
     - `system`: the system, for `integrate`.
-    - `args`: the values of the file for all `parameters`, as a dictionary by kind and
-        name. Add the controls of the actuators as `args["controls"]`, of shape (nu,);
-        they are zero by default.
+    - `args`: the values of the file for the `parameters` given to `from_mujoco`, as a
+        dictionary by kind and name. Add the controls of the actuators as
+        `args["controls"]`, of shape (nu,); they are zero by default.
     - `coordinates`: the names of the velocities, in the order of v, which is the order
         of MuJoCo's `qvel`. A free joint has six names, a ball joint three.
     - `controls`: the names of the actuators, in the order of the controls.
@@ -92,9 +92,9 @@ class Robot(eqx.Module):
         **Returns:** a `State`.
 
         **Raises:** as `nhjax.initial_state`; `ValueError` for unknown joints;
-        `ValueError` if a left-out constraint is violated in this state, or does not
-        follow from the others with the lengths in `args` (not checked while JAX traces
-        the call); `ShapeError` for wrong shapes.
+        `ValueError` if a constraint that `from_mujoco` left out is violated in this
+        state, or does not follow from the others with the lengths in `args` (not
+        checked while JAX traces the call); `ShapeError` for wrong shapes.
         """
         rest = jnp.asarray(self._rest, jnp.result_type(float))
         position = self._array("qpos", qpos, rest)

@@ -2,8 +2,9 @@
 
 At the end of a branch, such a body needs no frame of its own. Its inertia is added to
 the inertia of its parent, as if both were fixed together. With the twist ξ of the
-parent, the joint rate s' then adds s' h·ξ + ½ I s'² to the kinetic energy. The program
-of a robot on wheels is therefore as short as a program written by hand.
+parent, the joint rate s' then adds s' h·ξ + ½ I s'² to the kinetic energy. Here h is
+the momentum of the body at s' = 1 and ξ = 0, and I is its moment of inertia about the
+joint. The program of a robot on wheels is therefore as short as one written by hand.
 """
 
 from collections.abc import Sequence
@@ -20,7 +21,7 @@ class Rotor(NamedTuple):
     """The part of the kinetic energy that depends on the rate of a rotor.
 
     - `joint`, `parent`: the indices of its joint and of the joint before it, or -1.
-    - `momentum`, `inertia`: h of shape (6,) for a twist (v, ω), and I.
+    - `momentum`, `inertia`: h and I in this energy; h is in the order (v, ω) of twists.
     """
 
     joint: int
@@ -98,8 +99,8 @@ def merge_rotors(
 def spatial_inertia(inertia: entries.Matrix) -> entries.Matrix:
     """Return M of the kinetic energy ½ ξ·M ξ = ½ m v² + v·(ω × m c) + ½ ω·I ω.
 
-    The pseudo-inertia gives the mass m, the moment m c and the inertia I about the
-    origin.
+    The twist is ξ = (v, ω). The pseudo-inertia gives the mass m, the product m c with
+    the centre of mass c, and the inertia I about the origin.
     """
     mass, (x, y, z) = inertia[3][3], [row[3] for row in inertia[:3]]
     trace = entries.total(inertia[i][i] for i in range(3))

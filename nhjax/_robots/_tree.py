@@ -3,8 +3,8 @@
 Each joint is a node of the tree. The recursions from the world to the ends of the tree
 treat all nodes at the same depth together. The number of operations in the program
 therefore grows with the depth, not with the number of joints: all legs of a robot cost
-no more operations than one leg. Small trees are written in scalars instead, because
-most entries of their frames are zero.
+no more operations than one leg. The programs of small trees compute single entries
+instead of arrays, because most entries of their frames are zero.
 """
 
 from collections.abc import Sequence
@@ -383,7 +383,7 @@ class Tree:
         return joined, jnp.concatenate(falls), jnp.concatenate(depths)
 
     def _own_twists(self, v: Array, rotations: Array) -> Array:
-        """Compute the twist of each node relative to the node before it."""
+        """Compute the twist of each node relative to its parent."""
         twists = []
         for node, (first, (_, joint)) in enumerate(
             zip(self.special_velocities, self.special, strict=True)
@@ -432,7 +432,7 @@ class Tree:
 
 
 def _rows_of(vectors: list[entries.Vector], dtype: Any) -> Array:
-    """Convert vectors to rows of an array. Vectors of Python floats must be zero."""
+    """Convert vectors to rows of an array; a vector of Python floats must be zero."""
     rows = jnp.zeros((len(vectors), 3), dtype)
     for number, vector in enumerate(vectors):
         if not all(isinstance(x, float) for x in vector):

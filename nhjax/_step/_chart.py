@@ -99,6 +99,8 @@ class AbstractChart(eqx.Module):
     ) -> Vector:
         """Compute the constant term of the stage momenta Π^i = base + h Σ â_ij F^j.
 
+        The coefficients â_ij belong to the method.
+
         **Arguments:**
 
         - `momentum`: μ_k, carried to the origin.
@@ -181,7 +183,7 @@ class FlatChart(AbstractChart):
     def base_momentum(
         self, momentum: Vector, transported: Vector, chart_force: Vector
     ) -> Vector:
-        """Return μ_k, because the two sums are equal on a vector space and cancel."""
+        """Return μ_k, because `transported` and `chart_force` are equal and cancel."""
         return momentum
 
     def advance(
@@ -241,8 +243,8 @@ class AbstractCurvedChart(AbstractChart):
     ) -> tuple[Vector, Vector]:
         """Apply Ad^*_{τ(y)} to a compensated sum; return a compensated sum.
 
-        With products that are rounded as usual, the rounding errors would accumulate
-        over the steps, like the rounding errors of plain sums.
+        Without compensation, the rounding errors would accumulate over the steps, as
+        in plain sums.
         """
         change = self.manifold.to_end_change(y, momentum)
         return two_sum(momentum, change + self.manifold.to_end(y, compensation))
@@ -323,7 +325,7 @@ class MiddleChart(AbstractCurvedChart):
         return -self._half, self._half
 
     def coordinates(self, increment: Vectors) -> Vectors:
-        """Compute the coordinates y = Ξ - ξ/2 of the stages."""
+        """Compute the coordinates y = Ξ - ξ/2 of the points that Ξ reach from g_k."""
         return increment - self._half[None]
 
     def momentum_at_origin(self, momentum: Vector) -> Vector:

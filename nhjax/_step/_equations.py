@@ -59,8 +59,9 @@ class StageUnknowns(eqx.Module):
         Λ = (start) λ_k + (end) λ_{k+1} + E y, where start, end and E are the constant
         matrices of `method.closure_weights`.
     - `holonomic`: the holonomic multipliers Λ^1..Λ^s.
-    - `end_acceleration`, `end_multiplier`: u̇ and λ_c at the end of the step; only the
-        symmetric closure has these unknowns.
+    - `end_acceleration`, `end_multiplier`: u̇ and λ_c, the acceleration and multiplier
+        of the continuous equations at the end of the step; only the symmetric closure
+        has these unknowns.
     - `impulse`: ε, the impulses at both ends of the step along ∂I/∂v of the invariants
         I; None if the run keeps no invariants.
     """
@@ -77,7 +78,10 @@ class StageUnknowns(eqx.Module):
 
 
 class StageForces(NamedTuple):
-    """The forces, multipliers and momenta at the stages i = 1..s, with residuals."""
+    """The forces, multipliers and momenta at the stages i = 1..s, with residuals.
+
+    `StageEquations` explains the symbols.
+    """
 
     force: Float[Array, "s n"]  # n^i, the body force w^i carried to the chart's origin
     multiplier: Float[Array, "s l"]  # Λ^i
@@ -92,23 +96,25 @@ class StageEquations(eqx.Module):
     in the chart of the method. Let y^i be the coordinates of stage i in the chart, and
     Π^i its momentum in the chart. Let w^i be the body force at stage i, including
     reactions, let n^i = Ad^*_{τ(y^i)⁻¹} w^i be this force carried to the origin of the
-    chart, and let F^i be the force of `AbstractChart.to_chart`. Let μ^i be the body
-    momentum at node i, and M the momentum μ_k carried to the origin. With `base` from
-    `AbstractChart.base_momentum`, the equations are
+    chart, and let F^i be the force in the chart, from `AbstractChart.to_chart`. Let μ^i
+    be the body momentum at node i, and M the momentum μ_k at the start of the step,
+    carried to the origin. With `base` from `AbstractChart.base_momentum`, the equations
+    are
 
     Π^i = base + h Σ â_ij F^j,    μ^i = Ad^*_{τ(y^i)} (M + h Σ a_ij n^j),
 
     the nonholonomic constraints at the nodes (q^i, μ^i), the holonomic constraints at
     the positions Q^i, i >= 2, and the time derivative of the holonomic constraints at
-    the end. The constraints at the first node hold by hypothesis H1, and the last node
-    is the end of the step by H3. With redundant constraints, only as many equations as
-    are independent are enforced; see `Redundancy`.
+    the end. The first node is the start of the step (hypothesis H1, see `Hypotheses`),
+    where the constraints hold already. The last node is the end (H3). With redundant
+    constraints, only as many equations as are independent are enforced; see
+    `Redundancy`.
 
     The closure of the multiplier enters in three places:
 
     - the constant matrices of `method.closure_weights`;
-    - the multiplier that a state carries, which is Λ^s for the propagated closure and
-        λ_c for the other closures (`end_state`, `first_step_state`);
+    - the multiplier of a `State`, which is Λ^s for the propagated closure and λ_c for
+        the other closures (`end_state`, `first_step_state`);
     - two more unknowns and equations if the closure uses λ_c at the end
         (`end_multiplier_is_unknown`).
 
@@ -263,9 +269,9 @@ class StageEquations(eqx.Module):
         return jnp.concatenate([kinematic, holonomic], axis=1)
 
     def _padded(self, weights: str, multiplier: Float[Array, " l"]) -> Array:
-        """Compute the part of Λ that comes from a known multiplier, such as λ_k.
+        """Compute the part of Λ that comes from `multiplier`, λ_k or λ_{k+1}.
 
-        The holonomic multipliers do not depend on this known multiplier.
+        The holonomic multipliers do not depend on it.
         """
         known = multiplier[: self.num_nonholonomic]
         part = jnp.outer(self.closure_weights(weights), known)
@@ -345,7 +351,7 @@ def forces_by_multiplier(
 def momenta_of_forces(
     stages: StageEquations, x: StageUnknowns, forces: Float[Array, "s n c"]
 ) -> tuple[Float[Array, "s n c"], Float[Array, "r n c"]]:
-    """Compute the momenta / h that forces at the stages cause at stages and nodes.
+    """Compute 1/h times the momenta that stage forces cause at stages and nodes.
 
     On a Lie group, the chart transports the forces between stages, which adds a term of
     order h.

@@ -27,9 +27,9 @@ JacobianName: TypeAlias = Literal["leading", "first_order", "full"] | None
 
 # The terms make a step faster if the saved iterations cost more time than the terms.
 # This is the case if there are no holonomic constraints, and at most this many stages,
-# coordinates, and entries of the responses of stages to multipliers. For one trajectory
-# of a larger system, the program with the terms is no longer compiled to scalar
-# operations, which makes it several times slower.
+# coordinates, and derivatives of stage velocities with respect to multipliers. For one
+# trajectory of a larger system, the program with the terms is no longer compiled to
+# scalar operations, which makes it several times slower.
 _MOST_STAGES, _MOST_COORDINATES, _MOST_RESPONSES = 5, 6, 100
 
 
@@ -110,8 +110,8 @@ def _has_terms(stages: StageEquations) -> bool:
 class FirstOrderTerms(eqx.Module):
     """The terms of order h in the linearised stage equations of a Lagrangian system.
 
-    The equations of the stages, r_i = Π_i - base - h Σ â_ij F^j, change with the stage
-    velocities by
+    The residuals of the stages, r_i = Π_i - base - h Σ â_ij F^j (symbols as in
+    `StageEquations`), change with the stage velocities H_i and the increment ξ by
 
     δr_i = N_i δH_i + ∂Π/∂y δy_i - h Σ_j â_ij ∂F/∂H δH_j - ∂base/∂ξ δξ - ...,
     δy_i = h Σ_j a_ij δH_j,
@@ -123,7 +123,7 @@ class FirstOrderTerms(eqx.Module):
     are taken at the start of the step and multiplied by N⁻¹, so that with
     z_i = N⁻¹ r_i
 
-    δH_i = z_i - N⁻¹ (the terms, applied to z),
+    δH_i = z_i - N⁻¹ (the other terms, with z for δH),
 
     with an error of order h². The first term of the Neumann series is enough: the
     derivatives at the start of the step have an error of the same order.
@@ -247,9 +247,8 @@ class _BodySlopes(NamedTuple):
     """Derivatives at the start of a step, in the body frame.
 
     - `inertia_rate`: the rate of N = ∂p/∂u along the motion.
-    - `momentum`: the derivative, with respect to the position, of the difference
-        between the momentum there and the initial momentum that the chart transports
-        there.
+    - `momentum`: the derivative of p - p₀ with respect to the position, where p is the
+        momentum at this position, and p₀ is the initial momentum carried to it.
     """
 
     inertia_rate: Float[Array, "n n"]
@@ -259,11 +258,11 @@ class _BodySlopes(NamedTuple):
 class _ChartSlopes(NamedTuple):
     """Derivatives at the start of a step, in its chart.
 
-    - `turning`: the rate of ∂Π/∂H if y changes at the rate v, due to the change of
-        dτ_y.
+    - `turning`: the rate of ∂Π/∂H if only y changes, at the rate u, and with it dτ_y,
+        the derivative of the retraction.
     - `momentum`, `force`, `body_force`: ∂Π/∂y, ∂F/∂H and ∂w/∂H.
-    - `base`: the derivative of the constant term of Π with respect to the increment ξ
-        of the step.
+    - `base`: the derivative of `AbstractChart.base_momentum`, the constant term of Π,
+        with respect to the increment ξ of the step.
     """
 
     turning: Float[Array, "n n"]
@@ -326,8 +325,8 @@ def _coordinates(stages: StageEquations, x: StageUnknowns, u: Array) -> _ChartSl
     of_base = full_jacobian(base, stages.increment(x))
     if stages.method.chart == "middle":
         # A change δξ of the increment moves the coordinates of all points by -½ δξ,
-        # because the origin lies in the middle. Both ends contribute the same forces to
-        # the constant term.
+        # because the origin lies in the middle. Forces have the factor ½ in
+        # `MiddleChart.base_momentum`.
         of_base = of_base + 0.5 * slope + 0.5 * (body_force - force)
     else:
         of_base = of_base + body_force - force

@@ -1,8 +1,9 @@
 """The Jacobian of all stage equations of a step, by blocks, and its inverse.
 
-The leading part of the Jacobian has only the mass matrix and the Schur complement of
-the constraints. `LinearisedStep` has all derivatives of momenta, forces, reactions and
-constraints, at the starting values of the step, and solves the linear system exactly.
+Without terms of order h, the Jacobian has only the mass matrix and the Schur complement
+of the constraints. `LinearisedStep` has all derivatives of momenta, forces, reactions
+and constraints, at the starting values of the step, and solves the linear system
+exactly.
 """
 
 from collections.abc import Callable
@@ -83,9 +84,10 @@ class Slopes(NamedTuple):
 class LinearisedStep(eqx.Module):
     """The stage equations of one step, linearised at given stages.
 
-    The chart depends on the increment ξ, and stage i is at the increment Ξ_i from the
-    start. With Ξ_i = h Σ a_ij H_j and ξ = h Σ b_j H_j, the momenta Π_i of the stages,
-    their chart forces F_i and their transported forces n_i change by
+    `StageEquations` and `StageUnknowns` define Π, F, n, base, H and u. The chart
+    depends on the increment ξ = h Σ b_j H_j, and stage i is at the increment
+    Ξ_i = h Σ a_ij H_j from the start. The momenta Π_i of the stages, their chart forces
+    F_i and their transported forces n_i change by
 
     δΠ_i = ∂Π_i/∂H δH_i + ∂Π_i/∂Ξ δΞ_i + ∂Π_i/∂ξ δξ,
 
@@ -93,12 +95,14 @@ class LinearisedStep(eqx.Module):
     the reactions Bᵀλ with positions, and ∂F/∂H is the damping. The residuals of the
     stages are r_i = Π_i - base(ξ, h Σ b_j n_j, h Σ b_j F_j) - h Σ â_ij F_j. Their
     changes are a matrix of s n rows times δH. This matrix is inverted by blocks of n
-    rows. It does not split into smaller systems, since the matrices A and Â of the
-    method do not commute. The changes of the nodes follow from the changes of the
-    stages, and the multipliers from a Schur complement.
+    rows. It does not split into smaller systems, since the matrices (a_ij) and (â_ij)
+    do not commute. The changes of the nodes follow from the changes of the stages, and
+    the multipliers from a Schur complement. For nodes, r_i is the residual of the
+    equation that determines u_i.
 
-    For a Hamiltonian system δμ_i = (∂v_i/∂μ)⁻¹ (δH_i - ∂v_i/∂Ξ δΞ_i - ∂v_i/∂ξ δξ), and
-    the derivatives above include this change of μ_i.
+    For a Hamiltonian system, the stage momenta μ_i determine the velocities v_i = H_i.
+    Therefore δμ_i = (∂v_i/∂μ)⁻¹ (δH_i - ∂v_i/∂Ξ δΞ_i - ∂v_i/∂ξ δξ), and the derivatives
+    above include this change of μ_i.
     """
 
     stages: Float[Array, "s n s n"]  # the inverse of ∂r_i/∂H_j
@@ -271,9 +275,9 @@ def linearised_step(
 ) -> LinearisedStep:
     """Linearise the equations of stages and nodes at the stages x.
 
-    With `has_impulse_slopes` the result includes the effect of the changing direction
-    of the impulse at the end. This effect is small, as it is proportional to the
-    impulse.
+    The impulse that keeps the invariants at the end of the step changes its direction
+    with ξ and u. With `has_impulse_slopes` the result includes this effect, which is
+    proportional to the impulse and therefore small.
     """
     h, path, flat = stages.h, _path(stages, x), stages.manifold.is_flat
     a_hat, b = stages.coefficients("a_hat"), stages.coefficients("b")[None]
@@ -388,7 +392,7 @@ def _base_slopes(
     transported: Float[Array, "s n"],
     force: Float[Array, "s n"],
 ) -> list[Array]:
-    """Differentiate the constant term of Π.
+    """Differentiate `base`, the term that all stage momenta Π_i have in common.
 
     The derivatives are with respect to ξ, to h Σ b_j n_j and to h Σ b_j F_j.
     """
@@ -511,7 +515,7 @@ class ConstraintSlopes(eqx.Module):
         velocity: Float[Array, "s n"],
         at_nodes: Float[Array, "r n"],
     ) -> Float[Array, " e"]:
-        """Compute how `constraint_values` change with the stages and the nodes.
+        """Compute the changes of the constraints for given changes of H and all u_i.
 
         If constraints are redundant, the changes are multiplied by the projector P of
         `Redundancy`.

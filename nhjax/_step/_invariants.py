@@ -24,14 +24,15 @@ from .._system import (
 )
 
 
-# An impulse changes an invariant by at most this fraction of Σ |u ∂I/∂u|, added up over
-# both ends of the step. Near rest, where there may be no impulse that corrects the
-# error, this limit is small.
+# An impulse changes an invariant I by at most this fraction of Σ |u ∂I/∂u|, with the
+# fibre coordinate u (v or p), added up over both ends of the step. Near rest, where
+# there may be no impulse that corrects the error, this limit is small.
 _LARGEST_PART = 0.1
-# With an indefinite mass matrix, ω·M⁻¹ω can vanish although ω does not. If ω·M⁻¹ω is
-# less than this fraction of its bound Σ_ij |M⁻¹_ij| ω_i², a step has no impulse. All
-# other impulses are at most 1 / 0.03 times as large as with a definite matrix of the
-# same size. Fractions from 0.01 to 0.3 gave the same largest errors of test motions.
+# An impulse ε ω, with ω from `Directions`, changes I by ε ω·M⁻¹ω. With an indefinite
+# mass matrix M, ω·M⁻¹ω can vanish although ω does not. If it is less than this fraction
+# of its bound Σ_ij |M⁻¹_ij| ω_i², a step has no impulse. All other impulses are at most
+# 1 / 0.03 times as large as with a definite matrix that attains the bound. Fractions
+# from 0.01 to 0.3 gave the same largest errors of test motions.
 LEAST_PART = 0.03
 
 
@@ -87,11 +88,12 @@ class Invariants(eqx.Module):
     ) -> "Directions":
         """Compute the directions of the impulses at a state.
 
-        If a function is conserved only on the constraint set, its derivative ∂I/∂v has
-        a part Bᵀ μ along the reactions. An impulse along this part would violate the
-        constraints, and the reactions that restore them would undo its effect on I.
-        Therefore this part is removed, so that B M⁻¹ ω = 0. For the energy, ω = M v has
-        no such part: a system that conserves its energy has B v = 0.
+        If a function is conserved only on the constraint set Φ = 0, its derivative
+        ∂I/∂v has a part Bᵀ μ along the reactions, with B = ∂Φ/∂v. An impulse along this
+        part would violate the constraints, and the reactions that restore them would
+        undo its effect on I. Therefore this part is removed, so that the direction
+        ω = ∂I/∂v - Bᵀ μ satisfies B M⁻¹ ω = 0. For the energy, ω = M v has no such
+        part: a system that conserves its energy has B v = 0.
 
         `slopes` is ∂I/∂u, if it is known.
         """
@@ -120,9 +122,10 @@ class Invariants(eqx.Module):
     ) -> Float[Array, " k"]:
         """Compute the difference between I - μ·Φ and the values to keep.
 
-        Where the constraints hold, I - μ·Φ is equal to I, and its derivative is the
-        `slopes` of `directions`. To leading order, a correction of the constraints does
-        not change I - μ·Φ.
+        Here Φ = 0 are the constraints, and μ the `multipliers` of `directions`. Where
+        the constraints hold, I - μ·Φ is equal to I, and its derivative is the `slopes`
+        of `directions`. To leading order, a correction of the constraints does not
+        change I - μ·Φ.
         """
         error = self.error(system, t, q, u, args)
         multipliers = self.directions(system, t, q, u, args).multipliers
@@ -179,9 +182,11 @@ def _is_constrained(system: AbstractMechanicalSystem) -> bool:
 class Directions(NamedTuple):
     """The directions of the impulses that keep invariants, at one state.
 
-    - `slopes`: ∂I/∂u - Bᵀ μ, which is ∂I/∂u without its part along the reactions.
-    - `covectors`: ω, the slopes as covectors, which are the directions.
-    - `multipliers`: μ = C⁻¹ B M⁻¹ ∂I/∂v; None if μ is known to be zero.
+    - `slopes`: ∂I/∂u - (∂Φ/∂u)ᵀ μ, which is ∂I/∂u without its part along the reactions.
+    - `covectors`: ω, the directions: the slopes or, if u is p, the slopes mapped from
+        velocities to momenta.
+    - `multipliers`: μ = C⁻¹ B M⁻¹ ∂I/∂v, with B = ∂Φ/∂v and C = B M⁻¹ Bᵀ; None if μ is
+        known to be zero.
     """
 
     slopes: Float[Array, "k n"]
@@ -193,17 +198,17 @@ class InvariantsAtStart(eqx.Module):
     """The invariants of a step, with their derivatives and sizes at its start.
 
     - `functions`: the functions, and the values that are kept.
-    - `slopes`, `covectors`: ∂I/∂u and ω = ∂I/∂v at the start.
+    - `slopes`, `covectors`: the fields of `Directions` at the start.
     - `momentum_inverse`: N⁻¹, which maps momenta to fibre coordinates.
-    - `row_sums`: Σ_j |K⁻¹_ij|, the entries of a diagonal matrix D with
-        |ω·K⁻¹ω| <= ω·Dω.
+    - `row_sums`: Σ_j |K⁻¹_ij| with the fibre Hessian K (D2D2L or D2D2H), the entries of
+        a diagonal matrix D with |ω·K⁻¹ω| <= ω·Dω.
     - `moving`: Σ |u ∂I/∂u| at the start; for the energy usually twice the kinetic
         energy.
     - `sizes`: the sizes of the terms of the invariants, to which their round-off is
         proportional.
-    - `position`: q_k before wrapping, and its accumulated rounding error. The end of
-        the step is computed and rounded from these two, so that the invariants are
-        kept at the rounded position.
+    - `position`: q_k before its angles are reduced to one turn, and its accumulated
+        rounding error. The equations of the step use them to compute the end with the
+        same rounding as in the next state, so that the invariants are kept there.
     """
 
     functions: Invariants
@@ -245,9 +250,10 @@ class InvariantCorrection(eqx.Module):
     """The linearised equations for the impulses ε of a step, near its solution.
 
     To leading order, a change of ε changes the invariants at the end by G δε with
-    G = Σ ∂I/∂u N⁻¹ ωᵀ. The sum has a term for each end, because the change of an
-    invariant by an impulse at the start persists until the end. In each row, the
-    equation r = 0 for the errors r of the invariants is blended with ε = 0:
+    G = Σ ∂I/∂u N⁻¹ ωᵀ, where N = ∂p/∂u and ω are the directions of the impulses. The
+    sum has a term for each end, because the change of an invariant by an impulse at the
+    start persists until the end. In each row, the equation r = 0 for the errors r of
+    the invariants is blended with ε = 0:
 
     a r / g + (1 - a) ε = 0,    g = G_ii,    a = x² / (x² + ϵ),    x = |g| δ / S.
 

@@ -1,10 +1,10 @@
 """The factors of the stage Jacobian, and the simplified Newton update that uses them.
 
-The stage equations are solved by iterations `x -> x - J⁻¹ r(x)`. Simplified Newton
-inverts a part of the Jacobian J once a step, in `factorise_stage_jacobian`: the mass
-matrix and the Schur complement of the constraints at the start of the step, with or
-without the terms of order h of `FirstOrderTerms`. With `FullFactors` it inverts all of
-J at the starting values. Each `simplified_newton_update` then evaluates the stage
+The stage equations r(x) = 0 are solved by iterations `x -> x - J⁻¹ r(x)`. Simplified
+Newton inverts a part of the Jacobian J once a step, in `factorise_stage_jacobian`: the
+mass matrix and the Schur complement of the constraints at the start of the step, with
+or without the terms of order h of `FirstOrderTerms`. With `FullFactors` it inverts all
+of J at the starting values. Each `simplified_newton_update` then evaluates the stage
 equations once and multiplies by these factors. The factors are stored as inverses,
 because all matrices are tiny: a triangular solve inside an iteration costs far more
 than a product.
@@ -91,9 +91,9 @@ def simplified_newton_update(
     x_next = factors.correct_nodes(stages, x_next, r_nodes, change)
     if stages.invariants is not None:
         # The impulses are corrected first, so that the constraints are evaluated with
-        # the changes by the impulses. In the other order, the multipliers would ignore
-        # these changes, on which the reactions do work. In a system nearly at rest this
-        # work is not negligible.
+        # the velocities after this change. In the other order, the multipliers would
+        # ignore these changes, on which the reactions do work. In a system nearly at
+        # rest this work is not negligible.
         error = invariant_errors(stages, x_next)
         x_next = factors.correct_impulses(stages, x_next, error)
     if factors.full is not None:
@@ -103,9 +103,10 @@ def simplified_newton_update(
         kinematic, holonomic = constraint_values(stages, x_next)
         x_next = factors.correct_multipliers(stages, x_next, kinematic, holonomic)
     if stages.end_multiplier_is_unknown:
-        # λ_c depends on v_{k+1} at zeroth order in h: it must be corrected with the new
-        # velocity. Otherwise each of the two errors adds to the other, and an iteration
-        # reduces them only by the square root of the usual factor.
+        # λ_c at the end depends on v_{k+1} at zeroth order in h: it must be corrected
+        # with the new velocity. Otherwise the errors of λ_c and v_{k+1} add to each
+        # other, and an iteration reduces them only by the square root of the usual
+        # factor.
         x_next = factors.correct_end(stages, x_next, end_residual(stages, x_next))
     return x_next, Evaluation(forces, r_nodes, jnp.asarray(False))
 
@@ -130,8 +131,8 @@ class FullFactors(eqx.Module):
 
     The unknowns for the multipliers are h δy and h δΛ, the changes of `closure` and
     `holonomic` in `StageUnknowns` times h. With the symmetric closure there is also
-    h δλ_c at the end of the step. A change h δλ_c includes the change of y that leaves
-    the nodes unchanged to leading order.
+    h δλ_c, with the continuous multiplier λ_c at the end of the step. A change h δλ_c
+    includes the change of y that leaves the nodes unchanged to leading order.
     """
 
     step: LinearisedStep
@@ -203,7 +204,7 @@ class FullFactors(eqx.Module):
     ) -> StageUnknowns:
         """Solve the linearised equations J dx = r with constant impulses.
 
-        `push` multiplies by J at the stages of these factors.
+        `push` multiplies by J at the `unknowns` of these factors.
         """
         h, m = stages.h, stages.num_nonholonomic
         momentum = jnp.zeros_like(r.momentum)[:, :0]
@@ -342,8 +343,9 @@ class NewtonFactors(eqx.Module):
 class StageJacobianFactors(eqx.Module):
     """A part of the Jacobian of the stage equations of one step, factorised.
 
-    With N and K at the start of the step, B_i at the nodes of given stages, R the node
-    rows of a_ij and δΛ the change of all multipliers, the unknowns change by
+    `Linearisation` defines N, K and B. With N and K at the start of the step, B_i at
+    the nodes of given stages, R the `node_rows` of a_ij, the residuals r and the change
+    δΛ of all multipliers, the fibre coordinates change by
 
     δu_i = -N⁻¹ r_u + h Σ_j â_ij K⁻¹ B_jᵀ δΛ_j        (stages),
     δu_i = -N⁻¹ r_v + h Σ_j R_ij K⁻¹ B_jᵀ δΛ_j        (nodes).
@@ -375,7 +377,7 @@ class StageJacobianFactors(eqx.Module):
     def correct_stages(
         self, stages: StageEquations, x: StageUnknowns, residual: Float[Array, "s n"]
     ) -> StageUnknowns:
-        """Return x with u - N⁻¹ r_u at the stages, and with the velocities of u."""
+        """Return x with u - N⁻¹ r_u at the stages, and the resulting velocities."""
         if self.full is not None:
             return self.full.correct_stages(stages, x, residual)
         change = self.momentum_inverse.matvec(residual)
@@ -526,8 +528,8 @@ def factorise_stage_jacobian(
 ) -> StageJacobianFactors:
     """Factorise the stage Jacobian, with N, K at the start of the step and B_i at x.
 
-    `jacobian` selects the part of the Jacobian, as for `SimplifiedNewton`. With
-    `"full"`, all derivatives are taken at x.
+    `StageJacobianFactors` explains N, K and B_i. `jacobian` selects the part of the
+    Jacobian, as for `SimplifiedNewton`. With `"full"`, all derivatives are taken at x.
     """
     factors = _factors_without_impulses(stages, x, lin, jacobian)
     if stages.invariants is None:
@@ -608,7 +610,8 @@ def _schur_complement(
 ) -> Float[Array, "c c"]:
     """Assemble the derivative of the constraints with respect to h y and h Λ.
 
-    `blocks` are the products B_i K⁻¹ B_jᵀ for i >= 2 and all j.
+    y and Λ are `closure` and `holonomic` of `StageUnknowns`. `blocks` are the products
+    B_i K⁻¹ B_jᵀ for i >= 2 and all j.
     """
     m, k, s = stages.num_nonholonomic, stages.num_holonomic, stages.method.stages
     a, a_hat, b = (stages.coefficients(name) for name in ("a", "a_hat", "b"))
@@ -794,7 +797,10 @@ def _end_change(
     xi: Float[Array, " n"],
     u: Float[Array, " n"],
 ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
-    """Compute how acceleration and λ_c at the end change with ξ and u."""
+    """Compute how acceleration and λ_c at the end change with ξ and u.
+
+    ξ is the increment of the step, and u the fibre coordinate at its end.
+    """
     by_moves = (
         small_einsum("kn,n->k", by_xi, xi) + small_einsum("kn,n->k", by_u, u)
         for by_xi, by_u in zip(*end_slopes, strict=True)
@@ -834,7 +840,7 @@ def _reactions(
 ) -> Float[Array, "s n c"]:
     """Compute the reactions at the stages for unit values of the multiplier unknowns.
 
-    These are the unknowns of the closure and the holonomic multipliers Λ.
+    The unknowns are `closure` and `holonomic` of `StageUnknowns`.
     """
     m, one = stages.num_nonholonomic, jnp.eye(len(jacobian), dtype=jacobian.dtype)
     weights = stages.closure_weights("E")
@@ -911,9 +917,9 @@ def increment_size(
         changes[1] = lin.fibre_hessian_inverse.matvec(changes[1])
         changes.append(x_next.momentum - x.momentum)
     if stages.constrained:
-        # Multipliers are measured by their effect h N⁻¹ R δΛ on u, separately from the
-        # changes of u itself: Λ can still be wrong where the stages and nodes happen to
-        # be right.
+        # Multipliers are measured by their effect h N⁻¹ R δΛ on u (N⁻¹ R is
+        # `lin.reaction`), separately from the changes of u itself: Λ can still be wrong
+        # where the stages and nodes happen to be right.
         before, after = map(stages.multiplier_change, (x, x_next))
         # With one constraint, the matrix has one column. Its largest entry gives the
         # same norm for less work.

@@ -174,8 +174,8 @@ def _extrapolated(
     **Returns:** this size, and the growth r from order to order.
     """
     number = sizes.shape[0]
-    # If the first derivative vanishes in the middle of the step, it is about half of
-    # U_2 at the ends. U_1 is taken at least as large.
+    # If the first derivative vanishes in the middle of the step, it is about U_2 / 2 at
+    # the ends. A smaller U_1 is replaced by this value.
     first = jnp.maximum(sizes[0], 0.5 * sizes[1])
     first = jnp.maximum(first, float(jnp.finfo(sizes.dtype).tiny) ** 0.25)
     last = sizes[-1]
@@ -203,9 +203,9 @@ def _root(x: FloatScalar, n: int) -> FloatScalar:
 def derivative_weights(method: AbstractMethod) -> np.ndarray:
     """Return the weights by which samples at the nodes give h^k f^(k), k = 0, 1, ....
 
-    Row k has the coefficient of the Legendre polynomial of degree k on the step, times
-    (2k)! / k!, the k-th derivative of that polynomial. If nodes coincide, only the
-    first of them has a weight.
+    Row k gives the coefficient of the Legendre polynomial of degree k on the step,
+    times (2k)! / k!, the k-th derivative of that polynomial. If nodes coincide, only
+    the first of them has a weight.
     """
     nodes, first = np.unique(method.c, return_index=True)
     basis = np.polynomial.legendre.legvander(2 * nodes - 1, len(nodes) - 1)

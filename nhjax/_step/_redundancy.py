@@ -20,15 +20,16 @@ class Redundancy(eqx.Module):
 
     (1 - P) diag(C) h Λ = 0,
 
-    so that the multipliers keep the least norm, up to the change of the constraint
-    derivatives within the step.
+    with the step size h and the multipliers Λ of the constraints Φ, so that the
+    multipliers keep the least norm, up to the change of the constraint derivatives
+    within the step.
 
     P must not mix nonholonomic and holonomic constraints: nonholonomic constraints are
-    imposed at the nodes, but holonomic constraints at the stages, where their rates do
-    not vanish. Therefore P is block diagonal, with the first and the last diagonal
-    block of C C⁻. If a combination of nonholonomic constraints follows from holonomic
-    ones, it is among the replaced equations. At the end of the step both kinds of
-    constraints hold, and so do all equations that follow from them.
+    imposed at the nodes, but holonomic constraints at the stages, where the rates of
+    holonomic constraints do not vanish. Therefore P is block diagonal, with the first
+    and the last diagonal block of C C⁻. If a combination of nonholonomic constraints
+    follows from holonomic ones, it is among the replaced equations. At the end of the
+    step both kinds of constraints hold, and so do all equations that follow from them.
     """
 
     projector: Float[Array, "l l"]  # P

@@ -11,11 +11,11 @@ from .._numerics import max_norm, nonzero_or_one, stop_gradient
 from .._system import FunctionNoise, Linearisation
 
 
-# When the increments of the stages stop falling, they can be six times as large as the
-# round-off that the functions of a system cause in them. Increments count as noise up
-# to `NOISE_UNITS` = 400 times a given round-off, which is too much here. The measured
-# round-off is therefore multiplied by `PART`: increments up to 50 times the measured
-# round-off then count as noise.
+# When the increments of the stage solver stop falling, they can be six times as large
+# as the round-off that the functions of a system cause in them. Increments count as
+# noise up to `NOISE_UNITS` = 400 times a given round-off, which is too much here. The
+# measured round-off is therefore multiplied by `PART`: increments up to 50 times the
+# measured round-off then count as noise.
 PART = 1 / 8
 
 
@@ -29,10 +29,11 @@ def noise_of_step(
     can change by orders of magnitude, for instance where constraints become dependent.
     Therefore each step computes the effect with its own matrices,
 
-    |M⁻¹| (δp + |h| δf) + |N⁻¹ R| (c δφ + ĉ δΓ / |h|),
+    |N⁻¹| (δp + |h| δf) + |N⁻¹ R| |C⁻¹| (c δφ + ĉ δΓ / |h|),
 
     with the round-off δp of momenta, δf of forces, δφ of constraints on velocities and
-    δΓ of holonomic constraints. The factors c and ĉ are `magnifications`.
+    δΓ of holonomic constraints. `Linearisation` explains the matrices N, R and C, and
+    `magnifications` computes the factors c and ĉ.
 
     **Arguments:** `method`; `lin`, the linearisation at the start of the step; `noise`,
     the round-off of the functions of the system; `h`, the step size, of any sign. If h
@@ -58,13 +59,14 @@ def noise_of_step(
 def magnifications(method: AbstractMethod) -> tuple[float, float]:
     """Compute how much a step magnifies random errors of its constraints.
 
-    The change h N⁻¹ R δΛ in a step is larger, by the computed factor, than the change
-    that would correct the error of a single constraint. The factor is the largest
-    Euclidean norm of a row of a matrix. For nonholonomic constraints this matrix is
-    E (A_{2:} E)⁻¹. For holonomic constraints it is the inverse of the matrix with the
-    rows A_{2:} Â and b. A_{2:} is A without its first row, and E belongs to the closure
-    of the multiplier. Pseudo-inverses are used, because a method that does not support
-    one of the two kinds of constraints can have a singular matrix.
+    The change h N⁻¹ R δΛ of the fibre coordinates in a step is larger, by this factor,
+    than the change that would correct the error of a single constraint. The factor is
+    the largest Euclidean norm of a row of a matrix. For nonholonomic constraints this
+    matrix is E (A_{2:} E)⁻¹. For holonomic constraints it is the inverse of the matrix
+    with the rows A_{2:} Â and b. A, Â and b are the coefficients of the method, A_{2:}
+    is A without its first row, and E is in `closure_weights`. Pseudo-inverses are used,
+    because a method that does not support one of the two kinds of constraints can have
+    a singular matrix.
 
     **Returns:** the factor for nonholonomic and the factor for holonomic constraints.
     """

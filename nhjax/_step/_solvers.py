@@ -54,15 +54,15 @@ from ._round_off import noise_of_step, PART
 from ._step import AbstractStageSolver, FrozenNewtonMap
 
 
-# If N⁻¹ times the residual is larger than this, relative to the fibre coordinates, the
-# iterate is not a solution.
+# If the residual, mapped from momenta to fibre coordinates (v or p), is larger than
+# this fraction of the fibre coordinates, the iterate is not a solution.
 _GROSS = 1e-6
 # For systems with more coordinates, or steps with more unknowns, Newton's method solves
 # its equations by `jnp.linalg.solve`, and not by blocks.
 _MOST_COORDINATES, _MOST_UNKNOWNS = 32, 256
 # After this many iterations of simplified Newton, the fallback to Newton's method takes
-# less time than further iterations. With more than 100, `iterate` would accept a last
-# increment that Newton's method can reduce.
+# less time than further iterations. With a limit above 100, `iterate` would accept a
+# last increment that Newton's method can reduce.
 _MOST_BEFORE_NEWTON = 100
 
 
@@ -444,7 +444,7 @@ def fibre_coordinate_scale(
     """Estimate the size of the fibre coordinates of a step and their round-off.
 
     The size is the sum of three sizes: of the coordinates at the starting values x0, of
-    their change over the step, and of the part of this change by reactions, which
+    their change over the step, and of the part of this change that reactions cause and
     forces may cancel. For a system at rest only the changes remain.
 
     The additional round-off has these parts:
@@ -488,7 +488,7 @@ def fibre_coordinate_scale(
 def _kinematic_scale(
     stages: StageEquations, q: PyTree[Array], x0: StageUnknowns
 ) -> Float[Array, " m"]:
-    """Estimate how nonholonomic constraints change if positions change by their size.
+    """Estimate how nonholonomic constraints change if q changes by its own size.
 
     One direction of change is enough for an estimate. Changing each coordinate
     separately would need one derivative per coordinate.

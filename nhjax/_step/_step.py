@@ -66,9 +66,9 @@ class StepState(eqx.Module):
     """The data that one step passes to the next: a state, and its linearisation.
 
     The compensations are the accumulated rounding errors of the sums q and p. The
-    linearisation `lin` gives the Jacobian of the next step and the multiplier λ_c. It
-    is valid only for the system and the args with which it was computed;
-    `first_step_state` computes a new one.
+    linearisation `lin` gives the Jacobian of the next step and the continuous
+    multiplier λ_c. It is valid only for the system and the args with which it was
+    computed; `first_step_state` computes a new one.
     """
 
     state: State
@@ -136,7 +136,8 @@ class StepOutcome(NamedTuple):
     - `worst_coordinate`: the index of the coordinate whose momentum equations have this
         residual.
     - `constraint_violation`: the largest violation of a constraint at the end.
-    - `multiplier_defect`: the distance |Λ^s - λ_c| at the end.
+    - `multiplier_defect`: the distance |Λ^s - λ_c| between the multiplier of the last
+        stage and the continuous multiplier at the end.
     - `newton`: whether Newton's method took over from simplified Newton.
     - `invariant_error`: the largest error of an invariant at the end, relative to the
         size of its terms; None if the run keeps no invariants.
@@ -164,7 +165,7 @@ FrozenNewtonMap: TypeAlias = Callable[[StageEquations, StageUnknowns], StageUnkn
 
 
 class AbstractStageSolver(eqx.Module):
-    """A solver of the stage equations of a step, the option `stage_solver`."""
+    """A solver of the stage equations, for the option `stage_solver` of a run."""
 
     max_iterations: eqx.AbstractVar[int]
     tolerance: eqx.AbstractVar[FloatScalarLike]
@@ -336,7 +337,8 @@ def end_state(
     **Arguments:**
 
     - `q`, `u`, `p`: the configuration, the fibre coordinate and the momentum.
-    - `last_multiplier`: Λ^s, which the propagated closure carries to the next step.
+    - `last_multiplier`: Λ^s of the last stage, which the propagated closure carries to
+        the next step.
     - `continuous`: a function without arguments that returns λ_c(q, u). It is called
         only if a part of λ_c is needed.
     """
@@ -357,8 +359,9 @@ def step_record(
 ) -> StepRecord:
     """Build the record of a step.
 
-    Impulses are recorded as a constant force over the step. With this force, the
-    polynomial of the momentum in dense output ends at the momentum of the next state.
+    Impulses that keep invariants are recorded as a constant force over the step. With
+    this force, the polynomial of the momentum in dense output ends at the momentum of
+    the next state.
     """
     force = forces.force
     if stages.invariants is not None:
@@ -624,8 +627,8 @@ class ImplicitStep(AbstractImplicitFunction[StepArguments, StepOutcome]):
             return _end(eqx.combine(perturbed, fixed), self.method, x)
 
         rates = zero_unless(ok, rates)
-        # The solver started from a good guess. This iteration starts from zero, and is
-        # therefore allowed twice as many iterations.
+        # The solver started from a good guess. The iteration for dx has no such guess,
+        # and is therefore allowed twice as many iterations.
         limit = 2 * self.stage_solver.max_iterations
         dx = fixed_point_tangent(
             iteration, perturbed, rates, x, frozen.units, max_iterations=limit

@@ -53,7 +53,8 @@ class Linearisation(eqx.Module):
 
     u is the fibre coordinate of the system, v or p. The free force is the force without
     the reactions of the constraints. With N = ∂p/∂u, the Jacobian B = ∂Φ/∂u of the
-    constraints on velocities, and the reactions R = ♭ Bᵀ, the motion satisfies
+    constraints on velocities, and their reactions R λ, where R = ♭ Bᵀ, the motion
+    satisfies
 
     N u̇ - R λ = ad*_v p + free force - ∂t p - D1p v,    B u̇ = -∂t Φ - D1Φ v.
 
@@ -110,8 +111,8 @@ class Linearisation(eqx.Module):
         """Return which multipliers are unique: all if no constraints are redundant."""
         if not self.is_redundant:
             return jnp.ones(self.violation.shape, bool)
-        # The product C C⁻ projects onto the range of C. A multiplier is unique if its
-        # diagonal entry is one.
+        # C times its least-norm inverse projects onto the range of C. A multiplier is
+        # unique if its diagonal entry in this product is one.
         jacobian, reaction, _ = self.dense
         delassus = small_einsum("kn,nl->kl", jacobian, reaction)
         kept = small_einsum("kl,lm->km", delassus, least_norm_inverse(delassus))
@@ -220,7 +221,7 @@ class ConstraintMatrices(NamedTuple):
     def tangent_part(
         self, slope: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
-        """Project a derivative s = ∂I/∂u onto the directions allowed by constraints.
+        """Project s = ∂I/∂u of an invariant I onto directions that constraints allow.
 
         Return s - Bᵀ μ, which satisfies B K⁻¹ (s - Bᵀ μ) = 0, and the multipliers
         μ = C⁻¹ B K⁻¹ s.

@@ -147,9 +147,9 @@ def _finite_or_zero(x: Array) -> Array:
 class FunctionNoise(NamedTuple):
     """The round-off of the functions of a system at a state, for each component.
 
-    The functions are the momentum, the free force, all constraints on velocities, the
-    holonomic constraints on positions and, with a `direction`, the derivatives of all
-    constraints along this direction of u.
+    The functions are the momentum, the free force, all constraints on velocities and
+    the holonomic constraints on positions. With a `direction` of u, `function_noise`
+    adds `slopes` for the derivatives of all constraints along this direction.
     """
 
     momentum: Float[Array, " n"]

@@ -46,9 +46,10 @@ class State(eqx.Module):
     - `v`: the velocity, shape (n,); on a group the body velocity.
     - `p`: the momentum, shape (n,), with p = D2L(t, q, v) or v = D2H(t, q, p).
     - `multiplier`: shape (m + k,): λ of the m nonholonomic constraints, then ν of the k
-        holonomic ones. The reaction on the system is λᵀ D2Φ + νᵀ L_q^* DΓ, where L_q^*
-        gives the components in the body frame (the identity on R^n). A Hamiltonian
-        system has ♭_H D2Ψ in place of D2Φ, with ♭_H = (D2D2H)⁻¹.
+        holonomic ones. With the constraints Φ = 0 and Γ = 0, the reaction on the system
+        is λᵀ D2Φ + νᵀ L_q^* DΓ, where L_q^* gives the components in the body frame (the
+        identity on R^n). A Hamiltonian system with Ψ = 0 has ♭_H D2Ψ in place of D2Φ,
+        with ♭_H = (D2D2H)⁻¹.
 
     Create a state with `nhjax.initial_state`, which makes the four parts consistent.
     """

@@ -1,10 +1,10 @@
 """The operation that runs a program for many members, and its rules in JAX.
 
 `jax.vmap` of a compiled program is one operation, `batched_call`, which contains the
-program of one member. On the CPU this compiler vectorises over the members (SIMD). If
-it cannot compile the program, and the options allow single kernels, XLA compiles the
-program of one member to one kernel, which runs for one member after the other. In all
-other cases, and on other devices, JAX batches the program.
+program of one member. On the CPU the compiler of `nhjax.lanes` vectorises over the
+members (SIMD). If it cannot compile the program, and the options allow single kernels,
+XLA compiles the program of one member to one kernel, which runs for one member after
+the other. In all other cases, and on other devices, JAX batches the program.
 """
 
 from functools import partial

@@ -1,10 +1,9 @@
 """Conversion of a jaxpr to the graph: equation by equation, with inner programs.
 
 An array is either in registers, as a NumPy array of nodes, or in memory. Large arrays
-are in memory, and so are arrays that are read or updated at an index that is only known
-at run time.
-`Builder.run` interprets a jaxpr: for each equation it calls the operation that
-`_elementwise`, `_arrays` or `_control_flow` provides for the primitive.
+are in memory, and so are arrays that are read or updated at an index that is known only
+at run time. `Builder.run` interprets a jaxpr: for each equation it calls the operation
+that `_elementwise`, `_arrays` or `_control_flow` provides for the primitive.
 
 Loads and stores are statements in the order of the program. A store overwrites an array
 only if the array has no other users: `hold` and `release` count the users, and an array
@@ -387,7 +386,8 @@ class Builder:
     def run_body(self, body: Any, args: Sequence[ArrayValue]) -> list[ArrayValue]:
         """Compute the results of the body of a loop, a closed jaxpr.
 
-        A body without `has_iteration` has the programs that it calls written out.
+        The programs that the body calls are written out, unless the body contains a
+        loop of unknown length (`has_iteration`).
         """
         outer = self.is_written_out
         self.is_written_out = outer or not has_iteration(body.jaxpr)

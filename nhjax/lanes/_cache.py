@@ -8,9 +8,9 @@ an operation has a type that is not known here, such as a Python function, the p
 gets no key, and is compiled in each process.
 
 The cache follows JAX's options for its persistent compilation cache. It is a folder in
-JAX's directory, with one file for each program. A file contains the key, the name, a
-checksum and the code. Each file is written under another name first, so that other
-processes never read an incomplete file.
+JAX's directory, with one file for each program. A file contains a checksum, the key,
+the program's name for XLA and its code. Each file is written under another name first,
+so that other processes never read an incomplete file.
 """
 
 import dataclasses

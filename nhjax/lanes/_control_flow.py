@@ -661,7 +661,7 @@ def loop(
 
 
 def _starts(values: Sequence[ArrayValue]) -> list[tuple[int, Registers]]:
-    """List the arrays in registers, with the position of their first numbers."""
+    """List the arrays in registers, each with the position of its first number."""
     position, out = 0, []
     for value in values:
         if not isinstance(value, InMemory):

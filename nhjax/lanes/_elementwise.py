@@ -30,7 +30,7 @@ def _each(
 def _each_op(
     op: str, builder: Builder, equation: Any, values: list[ArrayValue]
 ) -> ArrayValue:
-    """Apply an operation that needs no parameters of the equation to each number."""
+    """Apply to each number an operation that ignores the equation's parameters."""
     aval = equation.outvars[0].aval
     function = partial(builder.graph.op, op)
     return builder.map_numbers(aval.shape, dtype_name(aval.dtype), function, *values)

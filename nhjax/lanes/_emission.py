@@ -62,7 +62,8 @@ def emit(
     """Write the kernel of a graph.
 
     Returns the text of its module, without the definitions of elementary functions, and
-    the elementary functions that it calls, in the form that `definitions` takes.
+    the elementary functions that it calls, in the form that
+    `_elementary_functions.definitions` takes.
     """
     live = LiveNodes(results)
     if width > 1:

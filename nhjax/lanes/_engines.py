@@ -36,7 +36,8 @@ class EngineUse(NamedTuple):
     - `reason`: why this engine was used, and why the engines that are tried before it
         were not used.
     - `members`: the number of members of an ensemble; `None` for a single run, and for
-        a function that is left to JAX because all of it calls Python or has effects.
+        a function that JAX computes alone, because effects or calls of Python leave no
+        part to compile.
     """
 
     engine: str

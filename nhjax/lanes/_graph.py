@@ -72,11 +72,11 @@ class Region:
 class Node:
     """A node of the graph: a number that is computed, or a statement.
 
-    `attr` is the data of the operation besides its arguments: the value of a constant,
-    the address of a load, the loop of a parameter. The passes over the finished graph
-    record in the node whether it is needed (`is_live`), whether it differs between
-    members (`is_divergent`), whether a uniform value is needed as a vector too
-    (`is_broadcast`), and the names in LLVM IR.
+    `attr` is the data of the operation besides its arguments, for example the value of
+    a constant, the address of a load, or the loop of a parameter. The passes over the
+    finished graph record in the node whether it is needed (`is_live`), whether it
+    differs between members (`is_divergent`), whether a uniform value is needed as a
+    vector too (`is_broadcast`), and the names in LLVM IR.
     """
 
     __slots__ = (
@@ -384,8 +384,9 @@ _FOLDS: dict[str, Callable[..., Any]] = {
 _Rule = Callable[..., Node | None]
 
 
-# The `op` of nodes whose value is known, and of arguments that the rules for sums and
-# products can simplify. Most nodes have another `op`, so that it is tested first.
+# `_KNOWN`: the `op` of nodes whose value is known. `_SPECIAL`: the `op` of arguments
+# that the rules for sums and products can simplify. Most nodes have another `op`, so
+# that the rules test it first.
 _KNOWN = frozenset(("const", "zero"))
 _SPECIAL = frozenset((*_KNOWN, "neg"))
 
@@ -704,7 +705,7 @@ _STATEMENTS = frozenset(
     ("load", "store", "loop", "branch", "param", "result", "call", "part")
 )
 
-# The operands of a program: its constants, and `None` for the other numbers.
+# The numbers in the operands of a program, with `None` for each non-constant number.
 _Pattern: TypeAlias = tuple[Node | None, ...]
 
 
@@ -782,7 +783,7 @@ class Functions:
 
 
 def _unify(one: Function, own: _Pattern, general: Function, wider: _Pattern) -> None:
-    """Let `one` call `general`, if the longer code costs little.
+    """Let `one` call `general`, if the longer code of `general` costs little.
 
     `general` must have fewer constants, and must not be much longer.
     """

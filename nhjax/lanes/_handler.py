@@ -67,8 +67,8 @@ PROGRAM = {
 # The data that the threads of a call share: the numbers of blocks begun and done, the
 # number of threads that hold the job, the number of threads of the pool, the number of
 # blocks, the index of the last member, whether a block failed, the addresses of the
-# data, and the program. The numbers of blocks begun and done change often, so that each
-# of these two has its own cache line.
+# operands and results, and the program. The numbers of blocks begun and done change
+# often, so that each of these two has its own cache line.
 JOB = {
     "begun": "i64",
     "padding_1": "[7 x i64]",

@@ -21,8 +21,8 @@ from ._writer import (
 )
 
 
-# The arguments of a rule: the writer, the node, the width of its result, and its
-# operands as text.
+# A rule writes a node's instructions. Its arguments are the writer, the node, the
+# number of members in its result, and its operands as text.
 _Rule = Callable[[Writer, Node, int, list[str]], str]
 
 _FLOAT_COMPARISONS = {

@@ -125,9 +125,9 @@ def rms_array_size(program: Any, per_loop: int = 1) -> float:
     An operation inside a loop counts `per_loop` times as much as an operation outside
     of the loop.
 
-    In a program with loops, large arrays outside of the loops do not count: such arrays
-    are often the rows of all steps, and the steps take far longer than an operation on
-    the rows.
+    In a program with loops, large arrays outside of the loops do not count: such an
+    array often holds the output of all steps, and the steps take far longer than an
+    operation on this array.
     """
     found = list(_arithmetic_sizes(program, 0))
     has_loop = any(depth for _, depth in found)
@@ -276,7 +276,7 @@ def variables(operands: Any) -> list[Any]:
 
 
 def _is_repeatable(equation: Any) -> bool:
-    # A dropped result has no name, so it cannot replace that of a repeated operation.
+    # A dropped result has no name, so it cannot replace the result of a repetition.
     return equation.primitive.name in _REPEATABLE and not any(
         isinstance(variable, jax.extend.core.DropVar) for variable in equation.outvars
     )

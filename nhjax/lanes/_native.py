@@ -27,7 +27,7 @@ class Target(NamedTuple):
 
 
 # The supported platforms: 64-bit little-endian machines with the POSIX functions that
-# the handler calls.
+# the code in `_handler` calls.
 _PLATFORMS = {("linux", "x86_64"), ("linux", "aarch64"), ("darwin", "arm64")}
 
 # The level of LLVM's passes on the IR. Kernels are already simplified when they are
@@ -40,8 +40,8 @@ _PASSES = 1
 # was 2 percent faster.
 _LONG_TEXT = 1_000_000
 _GENERATION_OF_SHORT, _GENERATION_OF_LONG = 2, 1
-# For modules of at least this length, such as gradients of machines, only a few passes
-# run. The other passes, of which moving invariant operations out of loops is the
+# For modules of at least this length, such as gradients of large mechanisms, only a few
+# passes run. The other passes, of which moving invariant operations out of loops is the
 # slowest, took a quarter of the compile time, and made the code only 4 percent faster.
 _VERY_LONG_TEXT = 4_000_000
 # The level of the passes and of the code generator for programs that must compile
@@ -121,7 +121,7 @@ def object_code(
 
 
 def assembly(texts: Sequence[str], exported: str, target: Target) -> str:
-    """Compile modules to assembly text, for readers."""
+    """Compile modules to assembly text, for people to read."""
     module, machine = _compiled(texts, exported, target, is_quick=False)
     return machine.emit_assembly(module)
 

@@ -381,7 +381,7 @@ def _name(*texts: str) -> str:
 
 
 # This compiler turns operations on arrays into operations on scalars. Measurements on
-# the gallery's systems with 2 to 8 stages, and on larger systems, show that its code is
+# the gallery's systems (2 to 8 stages), and on larger systems, show that its code is
 # faster than XLA's if the root mean square of array sizes is at most `_SMALL_ARRAYS`.
 # For larger arrays XLA is often faster, since it uses vectors for operations on arrays
 # even in a single run. But XLA takes more than 1 ms to compile an operation. Therefore,

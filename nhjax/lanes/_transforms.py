@@ -1,4 +1,4 @@
-"""`vmap` and `jit` for functions of the user, compiled as whole programs.
+"""`vmap` and `jit`, which compile the user's functions as whole programs.
 
 The function is traced to a program, which becomes one operation (`_kernel`). Under
 `jax.vmap` this operation becomes one operation for all members (`_batched_call`). Both

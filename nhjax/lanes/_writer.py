@@ -5,11 +5,11 @@ instructions of one function. Its method `value` appends an instruction that is 
 text and returns the name of the result. The code that writes kernels calls this method
 directly to save time, because a kernel has 10^4 instructions or more.
 
-Formulas are written with `Value`, the name of a result and its type. The operators of
-`Value` append instructions, so that the Python expression `(x - n * a) * b` writes the
-instructions that compute it.
-The functions below `Value` are the common arithmetic of the elementary functions:
-polynomials, and double-double numbers.
+Formulas are written with `Value`, which holds the name of a result and its type. The
+operators of `Value` append instructions, so that the Python expression
+`(x - n * a) * b` writes the instructions that compute it. The functions below `Value`
+are the common arithmetic of the elementary functions: polynomials, and double-double
+numbers.
 """
 
 import struct

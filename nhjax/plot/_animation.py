@@ -244,7 +244,7 @@ def _height(
     reach: float,
     ground: float | None,
 ) -> float:
-    """Compute half the height of a 3D picture, between 0.5 and 1 times `reach`."""
+    """Compute half a 3D picture's height: 0.5 to 1 times half its width `reach`."""
     heights = [x[..., 2].reshape(len(x), -1) for x in frames.values()]
     if ground is not None:
         heights.append(np.full((len(centres), 1), ground))

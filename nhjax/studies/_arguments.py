@@ -1,4 +1,4 @@
-"""The arguments of studies: their checks, their quick form, and the plan of a run."""
+"""The arguments of studies: checks, values for `--quick`, and the plan of a run."""
 
 import inspect
 import math
@@ -20,13 +20,15 @@ QUICK: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         "cvt-energy": {"final_time": 200.0, "dt": (0.1,)},
         "chaotic-energy": {"stages": (2,), "final_time": 40.0, "members": 20},
         "unicycle-order": {"stages": (2, 3), "dt": (0.25, 0.125)},
-        # In each fifth of these runs the ball moves at least once around its circle.
+        # The study compares the errors in the fifths of a run. In each fifth of these
+        # runs the ball moves at least once around its circle.
         "ball-invariants": {"stages": (3,), "dt": (0.2, 0.1), "num_steps": 1000},
     }
 )
 # For each study: the seconds to compile a program, the seconds per step of a trajectory
 # (both measured on two cores of 2 GHz), and whether the study compiles one program for
-# each pair (s, h). Otherwise it compiles one program for each s.
+# each pair of a number of stages s and a step size. Otherwise it compiles one for each
+# s.
 _COSTS: Mapping[str, tuple[float, float, bool]] = MappingProxyType(
     {
         "particle-order": (2.4, 1e-5, False),

@@ -57,8 +57,8 @@ class BallRun:
     - `integrals`: shape (k + 1, 4), the three linear first integrals and the moving
         energy.
     - `positions`: the horizontal position (x, y) of the ball, of shape (k + 1, 2).
-    - `circle_deviation`: the distance from the exact position when the run with the
-        smallest step ends.
+    - `circle_deviation`: the distance from the exact position at the time at which the
+        run with the smallest step ends.
     - `timing`: the times to compile and to run one program, which runs all step sizes
       with this s in one `jax.vmap`.
     """

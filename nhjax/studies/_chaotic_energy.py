@@ -416,8 +416,8 @@ def _figure(runs: list[ChaoticRun], title: str) -> "Figure":
 
 
 def _panel(ax: "Axes", runs: list[ChaoticRun], power: int) -> None:
-    # The error starts from zero. The lower limit of the axis leaves out the first tenth
-    # of the run, which would compress the curves.
+    # The error starts from zero. The lower limit of the axis ignores the first tenth of
+    # the run, whose small errors would compress the curves.
     levels = []
     for i, run in enumerate(runs):
         h, times = run.dt, run.times

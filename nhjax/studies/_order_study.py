@@ -188,8 +188,8 @@ class AbstractOrderStudy(AbstractStudyResult):
                 "round-off"
             )
         worst = np.nanmax(off)
-        # The tolerance of 0.5 is large, because with many stages the largest steps are
-        # not yet in the asymptotic regime.
+        # The tolerance of 0.5 is large: with many stages, only the largest steps have
+        # errors above round-off, and they are not yet in the asymptotic regime.
         agree = "agree with theory" if worst <= 0.5 else "do not all agree with theory"
         names = ", ".join(SYMBOLS[name][0] for name in self.quantities)
         return f"the orders of {names} {agree}; the largest difference is {worst:.2f}"

@@ -24,12 +24,13 @@ class AndrewsSqueezer(AbstractExample):
     Φ = (P₂ - P₃, P₂ - P₄, P₂ - P₆),  Q = (M, 0, 0, 0, 0, 0, 0).
 
     Here q = (β, θ, γ, φ, δ, Ω, ε) [rad]. The bodies K1 to K7 have the angles β, β + θ,
-    γ, φ + δ, δ, Ω + ε and ε. Each body turns about its inner joint: K1 about the origin
-    O, K2 about the end of K1, K3 about B, K5 and K7 about A, K4 about the end of K5, K6
-    about the end of K7. The points c_k are the centres of mass. The points P_k are the
-    outer ends; the outer ends of K2, K3, K4 and K6 meet in one joint P. A spring
-    connects the point D of K3 with the fixed point C. A motor turns K1 with the torque
-    M, so that K1 reaches nearly 11 000 revolutions a minute within 0.03 s.
+    γ, φ + δ, δ, Ω + ε and ε, which change at the rates ω_k. Each body turns about its
+    inner joint: K1 about the origin O, K2 about the end of K1, K3 about B, K5 and K7
+    about A, K4 about the end of K5, K6 about the end of K7. The points c_k are the
+    centres of mass. The points P_k are the outer ends; the outer ends of K2, K3, K4 and
+    K6 meet in one joint P. A spring connects the point D of K3 with the fixed point C.
+    A motor turns K1 with the torque M, so that K1 reaches nearly 11 000 revolutions a
+    minute within 0.03 s.
 
     **Parameters:** `masses` m_k [kg] and `inertias` I_k about the centres [kg m²], of
     shape (7,); `arms` and `centres`, the vectors from the inner joint to the outer end

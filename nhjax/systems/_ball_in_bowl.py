@@ -37,9 +37,9 @@ class BallInBowl(AbstractConstrainedGroupExample):
     velocity ω [1/s]. The centre moves on Φ = 0. This surface is a paraboloid (ε = 0) or
     a sphere of radius 1/κ (ε = 1), with its lowest point at the origin. The bowl is
     parallel to this surface, at the distance a below it; n is the normal of both. The
-    constraints φ are affine. They mean that the ball does not slip at the contact
-    x - a n. With the multipliers (λ₁, λ₂, μ) the force of the bowl is
-    (λ₁, λ₂, 0) + μ ∇Φ [N].
+    index ₁₂ selects the horizontal components. The constraints φ are affine. They mean
+    that the ball does not slip at the contact x - a n. With the multipliers
+    (λ₁, λ₂, μ) the force of the bowl is (λ₁, λ₂, 0) + μ ∇Φ [N].
 
     The energy E is not conserved, but the moving energy
     E - Ω (m (x ẏ - y ẋ) + k m a² (R ω)₃) is conserved. For a flat bowl, κ = 0, the
@@ -222,7 +222,7 @@ def _steady_spin(ball: BallInBowl, rate: Array) -> Array:
     On the circle, ω turns about the vertical at the given rate, so that ω' is along the
     path. The balance of moments about the centre, I ω' = -a n × F with the force F of
     the bowl, therefore determines the radial component of ω. `ball` is on the first
-    axis and has no spin; the spin supplies the rest of this component.
+    axis and has no spin; the spin must supply the missing part of this component.
     """
     normal, path = ball.bowl.normal(ball.q0[1]), ball.q0[1][0]
     moment = normal[0] * ball.gravity + normal[2] * rate**2 * path

@@ -74,7 +74,7 @@ def require_nonzero(name: str, value: float, consequence: str) -> None:
 
 
 def require_consistent(name: str, violation: ArrayLike, scale: ArrayLike) -> None:
-    """Raise if `name` violates a constraint by more than √ε (1 + |scale|).
+    """Raise if the data `name` violate a constraint by more than √ε (1 + |scale|).
 
     Here ε is the machine epsilon, and |scale| the largest absolute value in `scale`. An
     exact solution uses the constraint to eliminate velocities. With data that violate

@@ -34,24 +34,25 @@ class CarWithTrailers(AbstractNonholonomicExample):
 
     Φ = (n(θ₀)·ṙ₀, n(θ₀ + δ)·ṙ_front, n(θ₁)·ṙ₁ ... n(θₙ)·ṙₙ).
 
-    The car has the wheelbase L, the rear axle r₀ and the front axle r₀ + L e(θ₀). The
-    axles of the trailers are r_i = r_{i-1} - h_i e(θ_{i-1}) - d_i e(θ_i). The
-    multipliers are the forces of the ground on the axles, to the left of the wheels.
+    The car has the wheelbase L, the rear axle r₀ and the front axle
+    r_front = r₀ + L e(θ₀). The axles of the trailers are
+    r_i = r_{i-1} - h_i e(θ_{i-1}) - d_i e(θ_i). The multipliers are the forces of the
+    ground on the axles, to the left of the wheels.
 
     `args` is None or a pair: the force that drives the car at the rear axle [N] and
     the torque that steers the front wheels [N m]. Without the torque, the momentum
     J (θ̇₀ + δ̇) is conserved. Without the force and the torque, the energy is conserved
     too. `turning` creates a car that turns steadily.
 
-    **Parameters:** `num_trailers` n, static. For the car: `wheelbase` L, `centre` of
-    mass ahead of the rear axle [m], `mass` [kg], `inertia` about the centre and
-    `steer_inertia` J of the front wheels about the vertical [kg m²]. For the trailers:
-    `trailer_length` d from hitch to axle, `trailer_hitch` h, the distance of the hitch
-    behind the axle of the vehicle in front, `trailer_centre` of mass ahead of the axle
-    [m], `trailer_mass` [kg] and `trailer_inertia` about the centre [kg m²]. Each
-    parameter of the trailers is one number for all, or an array of n numbers. The
-    default values do not describe a particular car. The default `v0` is consistent at
-    `q0`, with a speed of 5 m/s.
+    **Parameters:** `num_trailers` n, static. For the car: `wheelbase` L; `centre`, the
+    distance of the centre of mass ahead of the rear axle [m]; `mass` [kg]; `inertia`
+    about the centre, and `steer_inertia` J of the front wheels about the vertical
+    [kg m²]. For the trailers: `trailer_length` d from hitch to axle; `trailer_hitch` h,
+    the distance of the hitch behind the axle of the vehicle in front; `trailer_centre`,
+    the distance of the centre of mass ahead of the axle [m]; `trailer_mass` [kg];
+    `trailer_inertia` about the centre [kg m²]. Each parameter of the trailers is one
+    number for all, or an array of n numbers. The default values do not describe a
+    particular car. The default `v0` is consistent at `q0`, with a speed of 5 m/s.
 
     **Source:** Laumond, *Controllability of a multibody mobile robot* (1993), and
     Rouchon, Fliess, Lévine and Martin, *Flatness and motion planning: the car with n

@@ -20,7 +20,7 @@ class ChaoticSystem(AbstractConstrainedExample):
     Φ = v_1 + Σ_{i=m+2..n} q_i v_i, in dimensionless units.
 
     **Parameters:** `m`, static, which sets the number of coordinates. The defaults of
-    `q0` and `v0` are the data of the middle row of `ensemble`, j = J/2.
+    `q0` and `v0` are the middle row of `ensemble`, with q_1 = v_2 = cos(π/4).
 
     **Source:** McLachlan and Perlmutter (2006) and Jay (2009), as in Martín de Diego
     and Sato Martín de Almagro, *High-order geometric methods for nonholonomic

@@ -19,8 +19,8 @@ class ChaplyginSphere(AbstractRollingBody):
     Here q = (R, x): the attitude quaternion and the position of the centre, which is
     also the centre of mass [m]; v and ω are the linear and angular velocity along the
     principal axes [m/s, 1/s]. Φ is the height of the contact, and φ the horizontal
-    velocity there. The multipliers are the components, along the axes of space, of the
-    force that the plane exerts on the sphere [N].
+    velocity (components 1 and 2) there. The multipliers are the components, along the
+    axes of space, of the force that the plane exerts on the sphere [N].
 
     The angular momentum about the contact, R K with K = I ω + m r² (ω - (ω·γ) γ), is
     constant in space, so that |K|² and K·γ are constant too, and the system is

@@ -28,7 +28,7 @@ class ChaplyginTop(AbstractRollingBody):
     centre of the sphere. The vector from the centre of mass to the contact is s; Φ is
     the height of the contact, and φ the horizontal velocity there. The multipliers are
     the components, along the axes of space, of the force that the plane exerts on the
-    sphere [N].
+    sphere [N]. e₃ is (0, 0, 1), and γ the upward vertical in body axes.
 
     If I₁ = I₂, the body is Routh's sphere, which is integrable. Besides the energy, two
     quantities are then conserved: Jellett's integral K·s, with the angular momentum K

@@ -21,7 +21,7 @@ class ContinuouslyVariableTransmission(AbstractConstrainedExample):
     of the driver, E_d = ½ ẏ² - cos y + ½ ε sin 2y, and the energy of the passenger,
     E_p = ½ (ẋ² + ż² + x² + z²), are conserved separately.
 
-    **Parameters:** `epsilon` ε >= 0, the perturbation of the pendulum [1]. The class
+    **Parameters:** `epsilon` ε >= 0, the perturbation of the pendulum. The class
     methods `low` and `high` create the system with the two sets of initial data of the
     paper: an oscillating driver (E_d = 4/5, E_p = 1; the default) and a rotating driver
     (E_d = 3, E_p = 1).
@@ -86,7 +86,8 @@ class ContinuouslyVariableTransmission(AbstractConstrainedExample):
     def exact_driver(self, t: float) -> tuple[float, float]:
         """Compute (y, ẏ) at `t` for ε = 0, unless the pendulum rests upright.
 
-        Let k² = (1 + E_d)/2. If the pendulum oscillates (k < 1), the solution is
+        Let k² = (1 + E_d)/2, and let t0 be the time shift that fits the initial data.
+        If the pendulum oscillates (k < 1), the solution is
         sin(y/2) = k sn(t + t0 | k²); if it rotates, y/2 = ±am(k(t + t0) | 1/k²).
         """
         if float(self.epsilon) != 0:

@@ -76,7 +76,7 @@ class FourBar(AbstractExample):
         """
         first, second, third, ground = cls(**parameters).lengths
         theta, dtheta = parameter(angle), parameter(rate)
-        # Solve the triangle of the crank's pin and the two ends of the rocker.
+        # Solve the triangle of the crank's end and the two ends of the rocker.
         side = jnp.stack([ground, jnp.zeros_like(ground)]) - first * direction(theta)
         square = side @ side
         distance = jnp.sqrt(square)

@@ -76,7 +76,7 @@ class KnifeEdge(AbstractConstrainedExample):
         }
 
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Compute (q, v, λ) at `t`, for consistent data with θ̇ != 0."""
+        """Compute (q, v, λ) at `t`, for consistent initial data with θ̇ != 0."""
         (x0, y0, heading0), (dx0, dy0, omega) = self._consistent_data()
         m, gravity = float(self.mass), float(self.gravity)
         require_nonzero("v0[2]", omega, "the knife edge moves along a straight line")

@@ -31,9 +31,10 @@ class Rattleback(AbstractRollingBody):
     are the axes of the ellipsoid; at rest, the third axis points upward. The vector
     from the centre of mass to the lowest point is s. Φ is the height of this point, and
     φ the horizontal velocity there. The multipliers are the components, along the axes
-    of space, of the force that the plane exerts on the body [N]. The third axis is a
-    principal axis of inertia, but the other two axes are not. Therefore a spin in one
-    sense turns into rocking, and the rocking into a spin in the other sense.
+    of space, of the force that the plane exerts on the body [N]. e₃ is (0, 0, 1), and γ
+    the upward vertical in body axes. The third axis is a principal axis of inertia, but
+    the other two axes are not. Therefore a spin in one sense turns into rocking, and
+    the rocking into a spin in the other sense.
 
     With `damping` σ the air exerts the torque -σω, and energy is not conserved.
 

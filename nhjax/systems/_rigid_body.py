@@ -102,8 +102,8 @@ def _euler_solution(
 ) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
     """Find the solution ω(t) of Euler's equations, and a bound on its rate.
 
-    The bound, the argument `rate` of `attitude`, is a bound on |ω| and on the inverse
-    of the time scale of ω.
+    The bound holds for |ω| and for the inverse of the time scale of ω. The caller
+    passes it to `attitude` as `rate`.
 
     Let 2 be the principal axis with the middle moment, and 3 the principal axis around
     which ω moves in the body; axis 3 has the largest or the smallest moment. Then ω₁,
@@ -144,7 +144,8 @@ def _euler_solution(
 def _cn_sn_dn_axes(moments: np.ndarray, omega0: np.ndarray) -> list[int]:
     """Find the axes along which ω is a multiple of cn, sn and dn, in this order."""
     low, middle, high = np.argsort(moments)
-    # The sign of L² - 2E I₂ gives the side of the separatrix on which ω is.
+    # With the angular momentum L, the energy E and the middle moment I₂, the sign of
+    # L² - 2E I₂ gives the side of the separatrix on which ω is.
     excess = moments * (moments - moments[middle]) * omega0**2
     around_high = excess[high] + excess[low] > 0
     if around_high:

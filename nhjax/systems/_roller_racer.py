@@ -158,5 +158,5 @@ class RollerRacer(AbstractGaitMachine):
 
 
 def _headings(q: Float[Array, " 4"]) -> Float[Array, " 2"]:
-    """Compute the angles of the two bodies in space, or their rates."""
+    """Compute the angles of the two bodies in space from q, or their rates from v."""
     return jnp.stack([q[2], q[2] + q[3]])

@@ -28,8 +28,8 @@ class AbstractRollingBody(AbstractConstrainedGroupExample):
     Here q = (R, x): the attitude quaternion and the position of the centre of mass [m];
     v and ω are the linear and angular velocity in body axes [m/s, 1/s]. The vector from
     the centre of mass to the lowest point is s, in body axes. Φ is the height of this
-    point, and φ the horizontal velocity of the body there. The multipliers are the two
-    horizontal components and the normal component of the force of the plane [N].
+    point, and φ the horizontal velocity (components 1 and 2) there. The multipliers are
+    the two horizontal components and the normal component of the plane's force [N].
     """
 
     mass: eqx.AbstractVar[Array]

@@ -23,8 +23,8 @@ class VerticalRollingDisc(AbstractConstrainedExample):
     L = m/2 (ẋ² + ẏ²) + I/2 ψ̇² + J/2 φ̇²,
     Φ = (ẋ - Rψ̇ cos φ, ẏ - Rψ̇ sin φ),  q = (x, y, ψ, φ).
 
-    Here ψ is the roll angle, and φ is the heading. The rates ψ̇ and φ̇ are constant,
-    and the contact moves on a circle of radius Rψ̇/φ̇.
+    Here (x, y) is the contact, ψ the roll angle, and φ the heading. The rates ψ̇ and φ̇
+    are constant, and the contact moves on a circle of radius Rψ̇/φ̇.
 
     **Parameters:** `mass` m [kg], `roll_inertia` I about the axle and
     `heading_inertia` J about the vertical [kg m²], `radius` R [m].

@@ -25,8 +25,9 @@ class RollingDisc(AbstractConstrainedGroupExample):
 
     ℓ = m/2 (v₁² + v₂²) + J/2 ω² + I/2 ψ̇²,  φ = (v₁ - Rψ̇, v₂).
 
-    Here q = ((x, y, φ), (ψ,)) with the heading φ and the roll angle ψ, and v = (v₁, v₂,
-    ω, ψ̇): v₁ along the heading, v₂ to its left. All four velocities are constant.
+    Here q = ((x, y, φ), (ψ,)), where this φ is the heading and ψ the roll angle, and
+    v = (v₁, v₂, ω, ψ̇): v₁ along the heading, v₂ to its left, ω the heading rate. All
+    four velocities are constant.
 
     **Parameters:** `mass` m [kg], `roll_inertia` I about the axle and
     `heading_inertia` J about the vertical [kg m²], `radius` R [m]; `retraction`, the

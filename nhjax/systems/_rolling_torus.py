@@ -28,8 +28,9 @@ class RollingTorus(AbstractRollingBody):
     are the linear and angular velocity in body axes [m/s, 1/s], and the third body axis
     is the axle. The vector from the centre to the lowest point is s; Φ is the height of
     this point, and φ the horizontal velocity there. The multipliers are the components,
-    along the axes of space, of the force that the plane exerts on the body [N]. With
-    r = 0, the default, the body is a disc of zero thickness: Euler's disc without slip.
+    along the axes of space, of the force that the plane exerts on the body [N]. e₃ is
+    (0, 0, 1), and γ the upward vertical in body axes. With r = 0, the default, the body
+    is a disc of zero thickness: Euler's disc without slip.
 
     The axle must not be vertical, because the lowest point is then not unique. In a
     steady motion the tilt is constant, and the centre moves on a circle or rests;

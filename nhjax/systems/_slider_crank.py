@@ -25,9 +25,10 @@ class SliderCrank(AbstractExample):
     L = Σ (m_k/2 |ċ_k|² + I_k/2 ω_k² - m_k g y_k) + m_s/2 ẋ²,
     Φ = (r cos θ + l cos φ - x, r sin θ + l sin φ - e),  Q = (M, 0, 0).
 
-    Here q = (θ, φ, x): the angles of the crank and of the rod from the horizontal
-    [rad], and the place of the slider [m], which runs along y = e. Crank and rod are
-    uniform bars: a bar of length l has I = m l²/12 about its centre c, at the height y.
+    Here Q is the generalised force, and q = (θ, φ, x): the angles of the crank and of
+    the rod from the horizontal [rad], and the place of the slider [m], which runs along
+    y = e. Crank and rod are uniform bars: a bar of length l has I = m l²/12 about its
+    centre c, at the height y.
 
     **Parameters:** `crank_length` r, `rod_length` l, `offset` e [m]; `crank_mass`,
     `rod_mass`, `slider_mass` m_s [kg]; `gravity` g [m/s²]; `torque` M on the crank

@@ -93,9 +93,9 @@ class Snakeboard(AbstractGaitMachine):
     ) -> "Snakeboard":
         """Create a board at the origin with θ = 0, whose centre moves ahead at `speed`.
 
-        The sideways velocity and the turning rate follow from the constraints.
-        `parameters` are the parameters of the class; without a `gait` among them the
-        joints move freely.
+        The sideways velocity and turning rate follow from the constraints. `joints` are
+        (ψ, φ_b, φ_f), and `parameters` the parameters of the class; without a `gait`
+        among them the joints move freely.
         """
         merged: dict[str, Any] = {"gait": None} | parameters
         board, angles = cls(**merged), coordinates(joints)

@@ -23,7 +23,7 @@ from ._linear_flow import linear_flow
 
 
 class SphericalPendulum(AbstractExample):
-    """A point mass on a rod, held by a holonomic constraint, on R³.
+    """A point mass in R³ on a rod, whose fixed length is a holonomic constraint.
 
     L = m/2 (ẋ² + ẏ² + ż²) - m g z,  Φ = x² + y² + z² - l²,  q = (x, y, z).
 
@@ -97,9 +97,9 @@ class SphericalPendulum(AbstractExample):
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute (q, v, λ) at `t`, for every consistent (`q0`, `v0`).
 
-        The height z = z₁ + (z₂ - z₁) sn² has the smallest and largest values z₁ and z₂,
-        and determines the multiplier λ. Then x and y satisfy the same linear equation,
-        m ẍ = 2λx, which is solved to round-off.
+        The height z = z₁ + (z₂ - z₁) sn², with Jacobi's elliptic function sn, has the
+        smallest and largest values z₁ and z₂, and determines the multiplier λ. Then x
+        and y satisfy the same linear equation, m ẍ = 2λx, which is solved to round-off.
         """
         require_consistent("q0", self.holonomic(0.0, self.q0, None), self.q0)
         require_consistent("v0", self.q0 @ self.v0, self.v0)

@@ -86,10 +86,10 @@ class Suslov(AbstractConstrainedGroupExample):
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute (q, v, λ) at `t`, for consistent data and `products` != 0.
 
-        Let √I₁₁ ω₁ = √(2E) cos α and √I₂₂ ω₂ = √(2E) sin α. Then α satisfies
-        α̇ = κ cos(α - α*) with constants κ and α*, so that the components of ω are
-        combinations of tanh and sech. The attitude satisfies a linear differential
-        equation, which is solved to round-off.
+        With the energy E, let √I₁₁ ω₁ = √(2E) cos α and √I₂₂ ω₂ = √(2E) sin α. Then α
+        satisfies α̇ = κ cos(α - α*) with constants κ and α*, so that the components of
+        ω are combinations of tanh and sech. The attitude satisfies a linear
+        differential equation, which is solved to round-off.
         """
         quaternion, v0 = self._consistent_data()
         I1, I2, _ = np.asarray(self.moments, dtype=np.float64)

@@ -144,10 +144,10 @@ class TurntableBall(AbstractConstrainedGroupExample):
     ) -> dict[str, Array]:
         """Compute the moving energy and, if `frame="space"`, the contact momentum.
 
-        The contact momentum is the angular momentum about the contact, along the axes
-        of space. For a homogeneous ball, its horizontal components are r(1 + a) times
-        the second and the third value of `first_integrals`, and its vertical component
-        is r²a times the first value.
+        The contact momentum is the angular momentum about the contact point, in the
+        axes of space. For a homogeneous ball, its horizontal components are r(1 + a)
+        times the second and the third value of `first_integrals`, and its vertical
+        component is r²a times the first value.
         """
         x, y = q[1]
         energy = self.energy(t, q, v)

@@ -26,9 +26,9 @@ class TwoWheeledRobot(AbstractNonholonomicExample):
 
     q = (x, y, θ, φ_R, φ_L): the middle r of the axle [m], the heading, and the angles
     of the right and of the left wheel [rad], which grow as the robot goes ahead. The
-    centre of mass of the platform is c = r + d e, and the centres of the wheels
-    are w = r ∓ b n, with the unit vectors e along the heading and n to its left. The
-    wheels roll and do not slip sideways:
+    centre of mass of the platform is c = r + d e. The sum is over the two wheels, with
+    the centres w = r - b n (right) and r + b n (left) and the unit vectors e along the
+    heading and n to its left. The wheels roll and do not slip sideways:
 
     Φ = (n·ṙ, e·ṙ + b θ̇ - ρ φ̇_R, e·ṙ - b θ̇ - ρ φ̇_L).
 

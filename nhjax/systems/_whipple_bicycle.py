@@ -42,8 +42,8 @@ class WhippleBicycle(AbstractNonholonomicExample):
     L = Σ ½ m |ċ|² + ½ ωᵀ I ω + m g c_z.
 
     The sum is over the rear wheel, the rear frame with its rider, the front frame and
-    the front wheel. The axes are the axes of the source: x forward, y to the right, z
-    down.
+    the front wheel, each with mass m, centre of mass c, angular velocity ω and inertia
+    I. The axes are the axes of the source: x forward, y to the right, z down.
 
     q = (x, y, ψ, φ, θ, δ, θ_R, θ_F): the contact point of the rear wheel [m], yaw, lean
     (to the right), pitch of the rear frame, steer (to the right) and the angles of the
@@ -69,7 +69,7 @@ class WhippleBicycle(AbstractNonholonomicExample):
 
     The model has no stop for the handlebar. When the bicycle falls, its velocities
     therefore grow without bound, until no step size is small enough. End the run with
-    an `Event` before |lean| reaches 0.8 or |steer| reaches 1.
+    an `Event` before |lean| reaches 0.8 rad or |steer| reaches 1 rad.
 
     **Parameters:** `wheelbase` w, `trail` c [m], `tilt` λ of the steer axis [rad],
     `gravity` g [m/s²]. For the wheels: `rear_radius`, `front_radius` [m],

@@ -163,7 +163,7 @@ class ConditionSigns(eqx.Module):
     """The sign of each condition where a step starts.
 
     - `sign`: the sign, 0 if it is not known.
-    - `value`: the value of the condition or, if `at_zero`, its rate along the run.
+    - `value`: the condition's value or, if `at_zero`, its rate times the sign of dt.
     - `at_zero`: whether the condition is zero and takes the sign of its rate.
     """
 
@@ -174,10 +174,10 @@ class ConditionSigns(eqx.Module):
     def after_step(
         self, at_node: BoolScalar, values: Float[Array, " e"]
     ) -> "ConditionSigns":
-        """Return the signs at the node that a step reaches, otherwise the old signs.
+        """Return the signs after a step: new signs at a node, otherwise the old signs.
 
-        `at_node` is whether the step reaches a node, and `values` are the conditions
-        at this node. A condition that is zero there keeps its old sign.
+        `at_node` is whether the step ends at a node t_k and not at an event. `values`
+        are the conditions at this node. A condition that is zero keeps its old sign.
         """
         sign = jnp.where(values == 0, self.sign, jnp.sign(values))
         return ConditionSigns(
@@ -311,7 +311,7 @@ def with_continuous_multiplier(
 ) -> State:
     """Return the state with the continuous multiplier λ_c.
 
-    States of a run have it already, except with the propagated closure.
+    States of a run have it already, except with `closure="propagated"`.
     """
     if not method.carries_multiplier:
         return y

@@ -10,10 +10,10 @@ from .._solution import EventLog
 
 
 class LogEntry(eqx.Module):
-    """The entry of one event in the log, or of all events along a leading axis.
+    """The entry of one event in the log, or the entries of all along a leading axis.
 
-    To undo the step to an event, a reverse replay starts from `before`, the state at
-    the event before the reset. It also needs the following fields.
+    A reverse replay, for derivatives, undoes the step to an event from `before`, the
+    state at the event before the reset. It also needs the following fields.
 
     - `iteration`: the index of the iteration of the time loop that ended at the event.
     - `node`, `offset`: the iteration started at t_k + offset, where k = `node`.

@@ -28,8 +28,8 @@ class TruncatedStep(NamedTuple):
 
     - `outcome`: the outcome of the step.
     - `h`: the size of the step.
-    - `fired`: the index of the event at its end, -1 if the step is not truncated.
-    - `values`: the values of the conditions at its end.
+    - `fired`: the index of the event at the step's end, -1 if it is not truncated.
+    - `values`: the values of the conditions at the step's end.
     - `crossed`: the conditions that crossed zero in the step.
     """
 
@@ -261,17 +261,18 @@ def _flat(signs: ConditionSigns, step: TruncatedStep) -> FloatScalar:
 
 
 class Bracket(eqx.Module):
-    """An interval of θ in which the first of several functions crosses zero.
+    """An interval in which the first of several functions of θ crosses zero.
 
-    At the lower end no function has crossed zero, and at the upper end the `crossed`
-    functions have crossed zero. The next point follows Chandrupatla (1997): inverse
-    quadratic interpolation if the last three points allow it, and otherwise bisection.
-    This method needs about as many evaluations as Newton's method, and at most about
-    three times as many evaluations as bisection.
+    θ in [0, 1] is the fraction of a step. At the lower end no function has crossed
+    zero, and at the upper end the `crossed` functions have crossed zero. The next point
+    follows Chandrupatla (1997): inverse quadratic interpolation if the last three
+    points allow it, and otherwise bisection. This method needs about as many
+    evaluations as Newton's method, and at most about three times as many evaluations as
+    bisection.
 
     - `new`, `other`, `old`: the newest point, which is one end of the interval; the
-        other end; and the previous end. Each point is a pair of θ and the values of all
-        functions there.
+        other end; and the end that the newest point replaced. Each point is a pair of θ
+        and the values of all functions there.
     - `is_upper`: whether the newest point is the upper end.
     - `crossed`: the functions that have crossed zero at the upper end.
     """

@@ -92,7 +92,7 @@ class EventLoopState(eqx.Module):
 class EventCarry(AbstractCarry):
     """The carry of a run with events.
 
-    Derivatives pass through `step_state` and through the time in `place`.
+    Derivatives pass through `step_state` and `place.offset`.
     """
 
     step_state: StepState
@@ -107,10 +107,11 @@ class ReplayedIteration(eqx.Module):
     - `node`, `offset`, `num_events`: the start of the iteration, as in
       `EventLoopState`.
     - `row`: the number of output rows that were filled before. For a discarded
-        iteration it is the number of steps, the index of an unused row.
+        iteration it is the number of steps of the run, which is the index of an unused
+        row.
     - `which`: the index of the event at the end of the iteration, or -1.
     - `size`: the size of the step.
-    - `scale`: as in `LogEntry`, for that event.
+    - `scale`: as in `LogEntry`, for the event `which`.
     - `is_active`: whether the iteration took a step or handled an event without a step.
         Otherwise the iteration was idle or discarded.
     - `was_truncated`: whether the previous iteration was discarded, because its step
@@ -177,7 +178,7 @@ class AttemptedStep(NamedTuple):
 
     @property
     def value(self) -> FloatScalar:
-        """Return the value of the event's condition if it is round-off, otherwise 0."""
+        """Return the event's condition if its value may be round-off, otherwise 0."""
         value, at_end = self.step.values[self.which], self.values_at_end[self.which]
         small = float(jnp.finfo(value.dtype).eps) ** 0.5
         is_small = self.is_kept & (jnp.abs(value) <= small * jnp.abs(at_end))
@@ -225,7 +226,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
 
     @property
     def may_end_early(self) -> bool:
-        """Return whether the number of attempts at steps is not known."""
+        """Return whether the number of attempts at steps is not known in advance."""
         return self.sizes is not None
 
     def is_over(self, carry: EventCarry) -> BoolScalar:
@@ -303,7 +304,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
     ) -> tuple[EventCarry, StepResult]:
         """Advance to the next node or event. A run that has ended does not change.
 
-        If an iteration is repeated, `replay` has the size and the event of its step.
+        If a reverse replay repeats an iteration, `replay` has its step size and event.
         """
         before, num_steps = carry.place, self.plain.num_steps
         attempt = self._attempt(carry, replay)
@@ -398,7 +399,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
     def _attempt(
         self, carry: EventCarry, replay: ReplayedIteration | None
     ) -> AttemptedStep:
-        """Take the rest of a step, or the part up to the event that `replay` has."""
+        """Take the rest of a step; if `replay` has an event, only the part up to it."""
         before, plain = carry.place, self.plain
         alive = ~self.is_over(carry)
         at_once = jnp.any(before.pending)
@@ -505,8 +506,8 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
             )
         if restarted is None:
             return clock, RESULTS.successful
-        # After a reset, the next node is moved, so that the rest of the step has the
-        # size of a first step.
+        # After a reset, the next node is moved: the rest of the step gets the size that
+        # the controller chooses for a first step.
         size, memory, result = restarted
         size, memory = jax.lax.stop_gradient((size, memory))
         is_reset = attempt.fires & jnp.asarray(resets)[attempt.which]
