@@ -201,7 +201,7 @@ class InvariantsAtStart(eqx.Module):
     - `slopes`, `covectors`: the fields of `Directions` at the start.
     - `momentum_inverse`: N⁻¹, which maps momenta to fibre coordinates.
     - `row_sums`: Σ_j |K⁻¹_ij| with the fibre Hessian K (D2D2L or D2D2H), the entries of
-        a diagonal matrix D with |ω·K⁻¹ω| <= ω·Dω.
+        a diagonal matrix D with |x·K⁻¹x| <= x·Dx for the slopes x.
     - `moving`: Σ |u ∂I/∂u| at the start; for the energy usually twice the kinetic
         energy.
     - `sizes`: the sizes of the terms of the invariants, to which their round-off is
@@ -313,7 +313,7 @@ class InvariantCorrection(eqx.Module):
         solved = inverse(matrix + eps**0.5 * one)
         # The gain is the ratio of the impulses to the impulses that a definite matrix,
         # the diagonal matrix of the row sums, would give for the same errors. With one
-        # function it is Σ (row sum) ω² / |g|.
+        # function it is Σ (row sum) (slope)² / |g|.
         squares = at_start.slopes**2 + slopes**2
         roots = jnp.sqrt(jnp.sum(at_start.row_sums[None] * squares, axis=1))
         gain = roots[:, None] * solved * (errors * roots)[None]
