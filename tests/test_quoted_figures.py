@@ -44,7 +44,8 @@ def test_front_constraint_violation_agrees_with_the_result(text):
     (claim,) = (x for x in claims if x["claim"].startswith(start))
     (measured,) = re.findall(r": (\S+)$", claim["measured"])
     members, time, printed = quoted(
-        text, "{} members over t = {}, the largest violation of the constraint is {}"
+        text,
+        "({} trajectories up to t = {}), the largest violation of the constraint is {}",
     )
     assert f"over {members} members" in claim["measured"]
     assert f"t <= {float(time):g}:" in claim["measured"]
@@ -76,7 +77,7 @@ def test_front_ensemble_memory_agrees_with_the_result():
 
 def test_front_bicycle_eigenvalues_agree_with_the_machines_page():
     (measured,) = quoted(page("machines"), "eigenvalues {};")
-    printed = quoted(FRONT["README"], "eigenvalues to {} ([machines]")
+    printed = quoted(FRONT["README"], "eigenvalues to {} from the Lagrangian")
     assert_agree(printed, [float(measured)])
 
 
@@ -259,7 +260,7 @@ def test_closure_worst_ratios_quoted_agree_with_the_result():
         for closure in ("symmetric", "consistent", "propagated")
     }
     sentence = (
-        'The largest ratio is {} for `"symmetric"` (the %s at s = %d), '
+        'The largest of these ratios is {} for `"symmetric"` (the %s at s = %d), '
         '{} for `"consistent"` (the %s at s = %d), and unbounded for '
         '`"propagated"` (the %s at s = %d does not finish)'
     )
@@ -275,9 +276,9 @@ def test_invariant_costs_and_errors_quoted_agree_with_the_result():
     rows, text = found["rows"], page("invariants")
     kept = [row["energy"][1] for row in rows]
     sentence = (
-        "largest relative error is {} (…). In plain runs it is between {} and {}; the "
-        "value {} is that of Suslov's problem in a potential with s = 2, t = 1e5. "
-        "Constraints are violated by at most {}, as in plain runs."
+        "largest relative error is {} (…). In plain runs it is between {} and {}; {} "
+        "occurs for Suslov's problem in a potential with s = 2, t = 1e5. Constraints "
+        "are violated by at most {}, as in plain runs."
     )
     plain = [row["energy"][0] for row in rows]
     worst = max(rows, key=lambda row: row["energy"][0])
@@ -336,7 +337,9 @@ def test_accepted_step_errors_quoted_agree_with_the_result():
     assert int(number) == sum(count.values())
     found = sum(row["simplified accepted"] + row["newton accepted"] for row in rows)
     assert int(accepted.replace(" ", "")) == pytest.approx(found, rel=0.01)
-    sentence = "For {} steps, the distance from the solution is at most {} times this"
+    sentence = (
+        "For {} steps, the distance between the two states is at most {} times this"
+    )
     floor = [count["at the floor"], NOISE_UNITS]
     assert_agree(quoted(text, sentence), floor)
     sentence = "In {} steps both solvers solve the equations and find two different"
@@ -418,7 +421,7 @@ def test_robots_quoted_agree_with_the_result():
         assert_agree(cells, measured)
     ratio = quoted(
         text,
-        "A run of {} platforms by `jax.vmap` takes {} times as long as a run of one",
+        "A run of {} mecanum platforms by `jax.vmap` takes {} times as long as a run of one",
     )
     ensemble = found["ensemble"]
     assert_agree(ratio, [ensemble["members"], ensemble["ratio"]])
@@ -467,6 +470,42 @@ def test_limits_of_adapting_quoted_agree_with_the_result():
     ]
     times = quoted(text, "a run with `PIDController` takes {} to {} times as long")
     assert_agree(times, [min(smooth), max(smooth)])
+    chaotic = next(row for row in found["limits"] if row["case"] == "chaotic")
+    percent = quoted(text, "for the chaotic system it is {} percent")
+    assert_agree(percent, [100 * chaotic["cancellation"]])
+    rows = rows_of(text, "steps over 1000 s", "number")
+    assert len(rows) == 3
+    for row in rows:
+        assert list(row) in found["rattleback"]
+
+
+def test_errors_over_tolerance_quoted_agree_with_the_result():
+    found, text = results("adaptive_steps"), page("step_sizes")
+    ours = [float(x) for line in found["tolerances"] for x in line[1:]]
+    sentence = "the median error at the end was {} times `rtol`"
+    assert_agree(quoted(text, sentence), [np.median(ours)])
+    sentence = "ten of `rtol` for {} percent of the runs, and up to {} times `rtol`"
+
+    def percent_within_ten(ratios):
+        return 100 * np.mean([0.1 <= x <= 10 for x in ratios])
+
+    assert_agree(quoted(text, sentence), [percent_within_ten(ours), max(ours)])
+    rows = [row for row in found["rows"] if row["error"] is not None]
+    shared = {row["case"] for row in rows if row["method"] == "diffrax Dopri8"}
+    assert len(shared) == 6
+    by_library = [
+        percent_within_ten(
+            row["error"] / row["setting"]
+            for row in rows
+            if row["case"] in shared and row["method"] == method
+        )
+        for method in ("PID", "diffrax Dopri8", "IDA, evaluations")
+    ]
+    sentence = (
+        "for {} percent of the runs of nhjax, for {} percent of the runs of diffrax, "
+        "and for {} percent of the runs of SUNDIALS IDA"
+    )
+    assert_agree(quoted(text, sentence), by_library)
 
 
 def test_parts_of_first_calls_quoted_agree_with_the_result():
