@@ -117,7 +117,7 @@ def linearise_along_velocity(system, t, y, args) -> LinearisedEquations:
 def linearise_along_symmetry(system, t, y, args, symmetry) -> LinearisedEquations:
     """Differentiate the equations and the generators of symmetries.
 
-    Both are vector fields on states, in the chart x -> (q τ(ξ), u + w).
+    Both are vector fields on states, in the chart x = (ξ, w) -> (q τ(ξ), u + w).
     """
     dim, count = y.p.shape[0], y.multiplier.shape[0]
     manifold = system.manifold_of(y.q)

@@ -154,8 +154,8 @@ def from_sympy(
     - `frame`: the inertial frame for forces at points and torques on frames.
     - `potential`: the potential energy of a `KanesMethod`. The default is the sum of
         the potential energies of its bodies. The argument is required if bodies have a
-        potential energy and there are loads: pass 0 if the loads include the forces of
-        this energy.
+        potential energy and there are loads, because the loads may already include the
+        forces of this energy: if they do, pass 0; otherwise pass the energy.
 
     **Returns:** a `SymPyModel` with the `system`, the `args` for `integrate`, and the
     names of the coordinates, which `Solution.to_xarray` uses.

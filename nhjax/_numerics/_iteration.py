@@ -221,8 +221,8 @@ def _progress(rules: _Rules, before: _Progress, sizes: UpdateNorms) -> _Progress
     converged = small | stagnant
     is_last = count >= rules.max_iterations
     if rules.max_iterations > _SLOW:
-        # Noise that is nearly as large as x says nothing about convergence, so that the
-        # noise is bounded here.
+        # If the noise is nearly as large as x, an increment below the noise does not
+        # show convergence. Therefore the noise is bounded here.
         eps = float(jnp.finfo(increment.dtype).eps)
         limit = _LAST_UNITS * jnp.minimum(rules.noise, _LARGEST_NOISE * eps * measure)
         converged = converged | (is_last & (increment <= limit))

@@ -460,7 +460,7 @@ def _end_impulse_slopes(stages: StageEquations, x: StageUnknowns) -> tuple[Array
 
 
 class ConstraintSlopes(eqx.Module):
-    """The derivatives of all constraints at the nodes i >= 2 of given stages.
+    """The derivatives of all constraints at the nodes i >= 2, for given stages.
 
     The increments Ξ_i = h Σ a_ij H_j and ξ = h Σ b_j H_j determine the position of node
     i, and u_i is its fibre coordinate. `values` are the constraints on velocities,

@@ -259,8 +259,8 @@ class InvariantCorrection(eqx.Module):
 
     Here ϵ is the unit round-off, S is the size of the terms of I, and δ is the impulse
     that would change velocities by their own size, so that x does not depend on units.
-    Unless x is small, a is 1 up to round-off. At rest, where no impulse can keep I, x
-    and a vanish.
+    Unless x is small, a is 1 up to round-off. At rest no impulse can keep I; there x
+    and a are zero.
 
     With an indefinite mass matrix, G can also be singular away from rest. In such
     steps a = 0 for all kept functions; see `LEAST_PART`.

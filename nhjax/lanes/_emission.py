@@ -745,7 +745,7 @@ class _Memory:
         start = writer.value(f"load ptr, ptr {place}")
         if buffer.kind == "operand" and not self._is_batched(buffer):
             return start
-        # This is a vector with the address of the first number of each member.
+        # The returned vector has the address of the first number of each member.
         index, members = vector("i64", self.width), self._starts(buffer.size)
         return writer.value(f"getelementptr {kind}, ptr {start}, {index} {members}")
 

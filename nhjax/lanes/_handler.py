@@ -335,9 +335,9 @@ end:
 """
 
 
-# The functions that share the blocks of a call. `@nhjax.run` runs one block and
-# `@nhjax.work` all blocks that are left; `@nhjax.wanted` and `@nhjax.ask` get helpers,
-# `@nhjax.wait` waits for them, and `@nhjax.release` releases the job.
+# The functions that divide the blocks of a call among threads. `@nhjax.run` runs one
+# block and `@nhjax.work` all blocks that are left; `@nhjax.wanted` and `@nhjax.ask` get
+# helpers, `@nhjax.wait` waits for them, and `@nhjax.release` releases the job.
 POOL = "\n".join([_POOL_DECLARATIONS, _RUN, _WORK, _WANTED, _ASK, _WAITING])
 
 
