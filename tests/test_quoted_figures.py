@@ -421,8 +421,8 @@ def test_robots_quoted_agree_with_the_result():
         assert_agree(cells, measured)
     ratio = quoted(
         text,
-        "A run of {} mecanum platforms by `jax.vmap` takes {} times as long as a run of "
-        "one platform.",
+        "A run of {} mecanum platforms by `jax.vmap` takes {} times as long as a run "
+        "of one platform.",
     )
     ensemble = found["ensemble"]
     assert_agree(ratio, [ensemble["members"], ensemble["ratio"]])
