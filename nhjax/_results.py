@@ -146,7 +146,9 @@ class RESULTS(eqx.Enumeration, metaclass=_Named):
     max_steps_reached = (
         "The run took `max_steps` attempts at a step before it reached its end. Pass a "
         "larger `max_steps`, or allow larger errors; `SaveAt(checkpoint=True)` with "
-        "`throw=False` returns a checkpoint from which the run goes on."
+        "`throw=False` returns a checkpoint from which the run goes on. If the "
+        "equations of many attempts were not solved (`num_unsolved_steps` in `stats`), "
+        'pass `stage_solver=nhjax.SimplifiedNewton(jacobian="full")`.'
     )
     dt_min_reached = (
         "The error of a step is larger than the tolerance of the "

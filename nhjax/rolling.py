@@ -794,8 +794,9 @@ class Contacts(eqx.Module):
         """Compute the force of the ground on each body at its contact [N].
 
         The forces follow from the multipliers of the state. They are zero in directions
-        that are not constrained. For a contact with `touches=False`, the normal force
-        is not known and is returned as zero, because it has no multiplier.
+        that are not constrained, also if a law of `nhjax.friction` acts there. For a
+        contact with `touches=False`, the normal force is not known and is returned as
+        zero, because it has no multiplier.
 
         **Arguments:**
 

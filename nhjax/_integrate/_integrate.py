@@ -341,13 +341,15 @@ def integrate(
         of = "" if isinstance(grid, VariableGrid) else f" of {grid.num_steps}"
         message = _INTERRUPTED.format(f"{done}{of}", float(sol.t1))
         warnings.warn(message, stacklevel=2)
-    elif throw:
+    if not _is_tracing() and has_default_jacobian(used):
+        # This comes before errors are raised, because unsolved steps can be the reason
+        # why a run did not reach its end.
+        _warn_of_iterations(sol, system, t0, state, args)
+    if throw and (_is_tracing() or not ended_as(sol, "interrupted")):
         _require_constraints(sol, system, t0, state, args)
         sol = raise_failures(sol, size, used_newton)
     if size is not None:
         _warn_of_errors(sol, size)
-    if not _is_tracing() and has_default_jacobian(used):
-        _warn_of_iterations(sol, system, t0, state, args)
     return sol
 
 

@@ -313,7 +313,10 @@ def _failure_message(
     others = f" ({len(failures) - 1} more members failed)" if failures[1:] else ""
     if dt is not None and "smaller `dt`" in reason:
         smooth = "if all forces are smooth, " if JUMPS in reason else ""
-        reason += f" `dt` is {dt:.6g}: {smooth}try {0.5 * dt:.6g}."
+        reason += (
+            f" `dt` is {dt:.6g}: {smooth}try {0.5 * dt:.6g}, or let the steps adapt, "
+            "with `t1` and `stepsize_controller=nhjax.PIDController(rtol, atol)`."
+        )
     message = f"Integration failed in {where}step {k}{others}: {reason}"
     if k > 0:
         message += " With `throw=False` the part before the failure is returned."

@@ -151,12 +151,21 @@ class AbstractMethod(eqx.Module):
         With p and r as for `order`, it is min(p, 2r + 2), but at most the order without
         constraints. For collocation on nodes that include 0 and 1, such as Lobatto's,
         the page on closures proves that the order is at least 2r + 2; runs with many
-        tableaux show that it is not higher.
+        tableaux show that it is not higher. One case is excluded: with
+        `closure="propagated"`, R_A(∞) = 1 and nodes that are not symmetric, errors of
+        the multiplier add up, and the order is at most 2r + 1.
 
         **Raises:** `ValueError`, as `require_constraint_hypotheses` does.
         """
         self.require_constraint_hypotheses()
-        return min(self.order, self.orders.B, 2 * self.orders.D + 2)
+        lost = int(self._multiplier_errors_add_up and not self.is_symmetric)
+        return min(self.order, self.orders.B, 2 * self.orders.D + 2 - lost)
+
+    @property
+    def _multiplier_errors_add_up(self) -> bool:
+        """Return whether each step adds its error to the propagated multiplier."""
+        is_one = abs(self.stability_at_infinity - 1) <= _UNIT_TOLERANCE
+        return self.carries_multiplier and is_one
 
     @property
     def hypotheses(self) -> Hypotheses:
@@ -190,8 +199,8 @@ class AbstractMethod(eqx.Module):
         self.require_constraint_hypotheses()
         if not self.carries_multiplier:
             return self.constrained_order
-        accumulates = abs(self.stability_at_infinity - 1) <= _UNIT_TOLERANCE
-        order = min(self.orders.C, self.orders.mixed) - int(accumulates)
+        lost = int(self._multiplier_errors_add_up)
+        order = min(self.orders.C, self.orders.mixed) - lost
         if self.is_symmetric:
             order += order % 2
         return min(order, self.constrained_order)

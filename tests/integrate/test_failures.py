@@ -140,7 +140,9 @@ def test_failure_message_names_coordinate_and_smaller_dt():
     stats = run_with(0.25, throw=False).stats
     assert (stats["failed_step"], stats["worst_coordinate"]) == (0, 1)
     assert run_with(1e-6).stats["worst_coordinate"] == -1
-    message = r"to coordinate 1\. `dt` is 0\.25: if all forces are smooth, try 0\.125\."
+    message = (
+        r"to coordinate 1\. `dt` is 0\.25: if all forces are smooth, try 0\.125, or"
+    )
     with pytest.raises(nhjax.IntegrationError, match=message):
         run_with(0.25)
     # Each lane has its own step size.

@@ -115,6 +115,22 @@ def test_order_with_constraints_without_collocation_agrees_with_runs():
     np.testing.assert_allclose(found, 2, atol=0.1)
 
 
+def test_order_where_multiplier_errors_add_up_on_asymmetric_nodes_is_one_lower():
+    nodes = (0, 0.1, 0.6, 6 / 7, 1)
+    method = _tableaux.collocation(nodes, "propagated")
+    np.testing.assert_allclose(method.stability_at_infinity, 1, rtol=1e-12)
+    assert (method.orders.D, method.constrained_order, method.multiplier_order) == (
+        0,
+        1,
+        0,
+    )
+    found = _tableaux.observed(*_tableaux.rolling(), method, (80, 160), 2.0)
+    np.testing.assert_allclose(found.q, 1, atol=0.1)
+    assert found.p < 1.8
+    other = _tableaux.collocation(nodes, "consistent")
+    assert other.constrained_order == 2
+
+
 # The other tableaux have |R_A(∞)| > 1 and raise an error.
 PROPAGATED = [
     "0, 1/3, 2/3, 1",
