@@ -272,7 +272,7 @@ def _raise_where(
 ) -> T:
     """Return `tree`, or raise an exception; see `raise_where`.
 
-    `described` is its argument `values`, with a `_Place` instead of each array.
+    `described` is `values` of `raise_where`, with a `_Place` instead of each array.
     """
     # The call-back outlives the trace: it may use shapes and dtypes of traced arrays,
     # but not the arrays.

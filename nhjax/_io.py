@@ -1,8 +1,8 @@
-"""The functions `save` and `load`, which write states and solutions to files.
+"""The functions `save` and `load`, which write and read states and solutions.
 
 A file is an .npz of NumPy without pickled objects. It has one entry for each array of
-the tree, and the entry `nhjax`, a JSON header that describes the structure of the tree
-by the names of classes and fields. No code is stored.
+the saved tree, and the entry `nhjax`, a JSON header that describes the structure of the
+tree by the names of classes and fields. No code is stored.
 """
 
 import dataclasses
@@ -66,7 +66,7 @@ def save(path: str | os.PathLike[str], tree: Any) -> None:
 
     - `path`: the name of the file, used without change; .npz is the usual suffix.
     - `tree`: an `nhjax.State`, `nhjax.Solution` (without dense output) or
-        `nhjax.Checkpoint`, or tuples, lists and dictionaries of these, of arrays,
+        `nhjax.Checkpoint`, or tuples, lists and dictionaries of these and of arrays,
         numbers and strings.
 
     **Raises:** `TypeError` that names the part that cannot be saved, such as dense
@@ -234,7 +234,7 @@ def _describe(tree: Any, arrays: dict[str, np.ndarray], path: str = "") -> Any:
     if tree is None or type(tree) in (bool, int, str):
         return {"kind": "value", "value": tree}
     if type(tree) is float:
-        # JSON has no infinity and no NaN: `_rebuild` reads `text`.
+        # JSON has no infinity and no NaN, so that `_rebuild` reads `text`.
         value = tree if math.isfinite(tree) else None
         return {"kind": "float", "value": value, "text": repr(tree)}
     if isinstance(tree, type(RESULTS.successful)) and tree._enumeration is RESULTS:

@@ -76,10 +76,9 @@ def momentum_map(
     **Arguments:**
 
     - `y`: a state, or a trajectory of states such as `sol.ys`.
-    - `generator`: the vector field ξ_Q, called as `generator(q)` with one
-        configuration, of shape (n,). On a group it is left-trivialised like the
-        velocity: for the symmetry g -> exp(εξ) g, return
-        `manifold.Ad(manifold.inverse(q), xi)`.
+    - `generator`: the vector field ξ_Q, of shape (n,), called as `generator(q)` with
+        one configuration. On a group it is left-trivialised like the velocity: for the
+        symmetry g -> exp(εξ) g, return `manifold.Ad(manifold.inverse(q), xi)`.
 
     **Returns:** one number for each state.
 

@@ -383,8 +383,8 @@ class Spring(_AbstractPulledBack):
     points stay apart.
 
     `system.energy` does not include the energy of a `Spring`. To include it, add
-    -½ k (|d| - l)² to the Lagrangian instead of using a `Spring`. The steps are the
-    same. A damper cannot be included in this way.
+    -½ k (|d| - l)² to the Lagrangian instead of using a `Spring`. The computed motion
+    is the same. A damper cannot be included in this way.
 
     **Arguments:**
 
@@ -506,7 +506,7 @@ class Motor(_AbstractPulledBack):
     - `angle`: φ, called as `angle(t, q, args)` [rad], of shape (): the rotation of the
         driven part relative to the part that carries the motor.
     - `command`: c, a number or a function of (t, q, v, args). Values outside
-        [-1, 1] are not limited: see `saturated`.
+        [-1, 1] are not limited; `saturated` can limit them.
     - `stall_torque`: τ₀ [N m], the torque of the motor at rest with c = 1.
     - `no_load_speed`: ω₀ [rad/s], the speed of the motor at zero torque and c = 1.
     - `gear`: i, turns of the motor for each turn of the angle.

@@ -3,9 +3,9 @@
 The load of a contact is a reaction, so that these forces depend on the multipliers. All
 laws are smooth: near rest, the friction is proportional to the velocity. A contact that
 should rest on an incline therefore creeps. If holding it takes the fraction r < 1 of
-the largest friction, a contact with the law `Coulomb` creeps at u₀ artanh(r), where u₀
-is the parameter `smoothing`. Near rest, the iteration of a step converges fast for time
-steps up to about u₀ · mass / friction.
+the largest friction, a contact with the law `Coulomb` creeps at the speed u₀ artanh(r),
+where u₀ is the parameter `smoothing`. Near rest, the iteration of a step converges fast
+for time steps up to about u₀ · mass / friction.
 """
 
 import abc
@@ -361,13 +361,13 @@ class RollingResistance(_AbstractOnContact):
 
     The torque is -|N| e tanh(|ω| / ω₀) in the direction of ω, the component of the
     body's angular velocity parallel to the plane. This law does not describe the
-    friction of a spinning coin, whose contact runs along the rim: write your own force
+    friction of a spinning coin, whose contact runs along the rim. Write your own force
     for it.
 
     **Arguments:**
 
     - `contacts`, `contact`: the contacts of the system, and the name of one of them.
-    - `arm`: e [m], the distance of the normal force ahead of the contact: the
+    - `arm`: e [m], the distance of the normal force ahead of the contact. It is the
         coefficient of rolling resistance times the radius.
     - `smoothing`: ω₀ [rad/s].
     - `load`: as for `Sliding`.

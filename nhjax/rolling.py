@@ -766,7 +766,7 @@ class Contacts(eqx.Module):
 
     @property
     def nonholonomic(self) -> "Slips | None":
-        """The velocities at the contacts that do not slip, or None if all slide."""
+        """The velocities of slip that must be zero, or None if all contacts slide."""
         rolling = tuple(x for x in self.contacts if x.no_slip)
         return Slips(rolling) if rolling else None
 
@@ -794,7 +794,7 @@ class Contacts(eqx.Module):
         """Compute the force of the ground on each body at its contact [N].
 
         The forces follow from the multipliers of the state. They are zero in directions
-        that are not constrained, also if a law of `nhjax.friction` acts there. For a
+        that are not constrained, even if a law of `nhjax.friction` acts there. For a
         contact with `touches=False`, the normal force is not known and is returned as
         zero, because it has no multiplier.
 

@@ -121,7 +121,8 @@ def linear_stability(
         exp(εξ) g, a symmetry of space, is `manifold.Ad(manifold.inverse(q), xi)`. The
         velocity must be a combination of the generators. If one generator is a rotation
         and another is a translation that it rotates, include the translations in all
-        directions that this rotation produces; otherwise the generators are not closed.
+        directions that this rotation produces; otherwise the generators are not closed
+        (they leave their span in the moving frame).
     - `must_be_steady`: whether to raise if the motion is not steady. Pass False to
         linearise at an instant, for instance along a trajectory.
 

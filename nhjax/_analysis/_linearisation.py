@@ -89,7 +89,7 @@ class LinearisedEquations(NamedTuple):
 
 
 def state_size(y: State) -> Array:
-    """Return the scale of a state's errors: its largest absolute value, or 1 if 0."""
+    """Return a scale for errors: the largest absolute value in a state, or 1 if 0."""
     return nonzero_or_one(max_norm(*jax.tree.leaves(y.q), y.v, y.p))
 
 
@@ -117,7 +117,8 @@ def linearise_along_velocity(system, t, y, args) -> LinearisedEquations:
 def linearise_along_symmetry(system, t, y, args, symmetry) -> LinearisedEquations:
     """Differentiate the equations and the generators of symmetries.
 
-    Both are vector fields on states, in the chart x = (ξ, w) -> (q τ(ξ), u + w).
+    Both are vector fields on states. Their components are taken in the chart
+    x = (ξ, w) -> (q τ(ξ), u + w).
     """
     dim, count = y.p.shape[0], y.multiplier.shape[0]
     manifold = system.manifold_of(y.q)
@@ -220,8 +221,8 @@ def lift_generators(
     δv = Dξ v + ad_v ξ,    δp = ad*_ξ p - Dξᵀ p,
 
     where Dξ is the derivative of χ -> ξ(q τ(χ)) at zero. A left translation changes
-    neither velocities nor momenta. A right translation, with constant ξ, changes v by
-    [v, ξ].
+    neither velocities nor momenta. A right translation, with constant ξ, changes v at
+    the rate [v, ξ].
     """
     manifold = system.manifold_of(q)
 
@@ -249,8 +250,7 @@ def difference_steps(
 class PermittedPerturbations(NamedTuple):
     """A basis Z of the permitted perturbations, and a left inverse W with W Z = 1.
 
-    `determined` is true if the basis is well defined: the equations that define it are
-    independent.
+    `determined` is true if the equations that define the basis are independent.
     """
 
     basis: Float[Array, "x d"]
@@ -302,7 +302,8 @@ def independent_basis(
         unit[jnp.asarray(positions, int)],
         unit[jnp.asarray(velocities, int)],
     )
-    # Least-norm changes: positions neither chosen nor constrained do not change.
+    # These changes have the least norm, so that positions that are neither chosen nor
+    # constrained do not change.
     wanted = jnp.concatenate(
         [
             jnp.eye(count, dtype=dtype),
@@ -370,7 +371,7 @@ def check_relative_equilibrium(
 
     **Arguments:**
 
-    - `orbit`: the generators around the state.
+    - `orbit`: the generators and the equations of motion near the state.
     - `rows`: the derivatives of the constraints.
     - `permitted`: the permitted perturbations that are not along the orbit.
     - `scale`: the largest absolute value in the state.
@@ -417,7 +418,7 @@ def _bracket_derivatives(
     """Differentiate the Lie brackets of the equations of motion with each generator.
 
     Second derivatives are central differences, which are accurate enough for a check.
-    Another automatic derivative would make the compile time three times as long.
+    Automatic second derivatives would make the compile time three times as long.
 
     **Returns:** the derivatives, and the sums of the absolute values of their terms.
     """

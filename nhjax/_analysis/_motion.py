@@ -88,8 +88,8 @@ def motion(
     M v̇ - Bᵀ λ = ad*_v p + D1L + F - (∂t + D1 v) p,    B v̇ = -(∂t + D1 v) Φ,
 
     or the corresponding equations of a Hamiltonian system. Here D1 is the derivative
-    with respect to q, D1 v this derivative along v, and F the force. To save reactions
-    along a trajectory, use
+    with respect to q, D1 v the directional derivative along v, and F the force. To save
+    reactions along a trajectory, use
     `SaveAt(fn=lambda t, y, args: nhjax.motion(system, t, y, args).reaction)`.
 
     **Arguments:**

@@ -103,14 +103,14 @@ def steady_motion(
     coordinates may change, such as the position of a bicycle on a circle.
 
     With `symmetry`, the result is a consistent state whose motion is an orbit of
-    symmetries of the system: with x = (q, u), the equations of motion ẋ = f(x) and the
-    generators X_k,
+    symmetries of the system. Let x = (q, u), let ẋ = f(x) be the equations of motion,
+    and let X_k be the generators. Then
 
     f(x) = Σ c_k X_k(x).
 
-    The state and the rates c are computed together. Examples are a wheel that rolls on
-    a circle and a precessing top, for which no coordinates of the attitude are
-    constant.
+    The state and the rates c are computed together. Choose this way if no coordinates
+    of the attitude are constant, as for a wheel that rolls on a circle or a precessing
+    top.
 
     If these equations have a family of solutions, the result is the solution to
     which Newton's method with least-norm increments converges. The `held_...` arguments
@@ -124,10 +124,10 @@ def steady_motion(
     - `t`: the time at which functions of time are evaluated.
     - `y`: a state from which the search starts.
     - `args`: passed on to the functions of the system.
-    - `positions`, `velocities`: the indices that must be steady. Leave out components
-        that follow from the others: positions that follow from holonomic constraints,
-        velocities that follow from nonholonomic constraints, and a speed that is
-        constant because energy is conserved.
+    - `positions`, `velocities`: the indices of the components that must be constant.
+        Leave out components that follow from the others: positions that follow from
+        holonomic constraints, velocities that follow from nonholonomic constraints, and
+        a speed that is constant because energy is conserved.
     - `symmetry`: generators of symmetries, as `linear_stability` takes them, in place
         of `positions` and `velocities`.
     - `held_positions`, `held_velocities`: the indices of the positions and velocities

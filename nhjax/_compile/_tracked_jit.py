@@ -59,7 +59,7 @@ _CONTAINERS += (types.SimpleNamespace, argparse.Namespace, eqx.Module)
 
 @lru_cache(maxsize=4096)
 def _names(code: types.CodeType) -> tuple[dict[str, None], dict[str, None]]:
-    """Return the names of globals and attributes that code and inner functions read."""
+    """Return names of globals and attributes that code and its inner functions read."""
     variables, attributes = {}, {}
     for instruction in dis.get_instructions(code):
         if instruction.opname in ("LOAD_ATTR", "LOAD_METHOD"):
@@ -224,9 +224,10 @@ def _static_fields(cls: type) -> tuple[str, ...] | None:
 
 
 def static_parts(tree: Any) -> list[Any]:
-    """List the leaves of a tree that are not arrays, and the static fields and the
-    classes of its nodes. The arrays are not listed, because they are arguments of the
-    compiled program.
+    """List the parts of a tree that are not arrays.
+
+    These are leaves other than arrays, and the classes and static fields of nodes.
+    Arrays are not listed, because they are arguments of the compiled program.
     """
     nodes: list[Any] = []
 
@@ -304,7 +305,7 @@ class _Key:
 # more.
 _MOST = 1000
 _changed_by_tracing: dict[Place, object] = {}
-# This maps the key without ignored values to the key at the time of tracing.
+# A key without the ignored values is mapped to the key at the time of tracing.
 _key_before_tracing: dict[_Key, _Key] = {}
 
 
@@ -318,8 +319,7 @@ def captured_by(*trees: Any) -> Captured:
 
 
 def tracked_jit(*tracked: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
-    """Compile like `equinox.filter_jit`; trace again if values that functions read
-    change.
+    """Compile like `equinox.filter_jit`; trace again if captured values change.
 
     The result is a decorator. The decorated function is called with positional
     arguments. If the caller already has the result of `captured_by`, it can be passed

@@ -1,9 +1,9 @@
 """A primitive that writes a row into a buffer, and is one operation until lowering.
 
 A loop that saves its states writes each row of a buffer once. JAX's own update of an
-array cannot assume this: its derivative in reverse mode sets the row of the cotangent
-to zero, for which XLA copies the whole buffer in each iteration. With JAX's update, the
-time of a gradient would grow with the square of the number of rows.
+array cannot assume this. Its derivative in reverse mode therefore sets the row of the
+cotangent to zero, and XLA copies the whole buffer for this in each iteration. With
+JAX's update, the time of a gradient would grow with the square of the number of rows.
 """
 
 from functools import partial

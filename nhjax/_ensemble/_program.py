@@ -182,7 +182,7 @@ class Members:
     def digest(self) -> str:
         """Compute a digest of the arrays of members.
 
-        If the members are given by a function, the program text identifies it instead.
+        If a function gives the members, the program text identifies this function.
         """
         if self._leaves is None:
             return "a function"
@@ -378,8 +378,8 @@ def _reduced(
 def merged_states(reductions: Any, one: Any, other: Any) -> Any:
     """Merge the states of reductions of two sets of members.
 
-    This is a separate program, so that the rounding is the same whether a state comes
-    from this process, another process or a file.
+    The merge is a separate program, so that the rounding is the same whether a state
+    comes from this process, another process or a file.
     """
     return each_reduction(_merge, reductions, one, other)
 

@@ -59,8 +59,8 @@ class Mean(AbstractReduction):
     """The mean over the members of an ensemble, for every number that `run` returns.
 
     mean = (1/n) Σ x_j. The sums are double-double numbers (Hida, Li, Bailey, 2001), so
-    that for any chunk size only two roundings matter: of the final sum to one number,
-    and of its quotient by n.
+    that for any chunk size only two roundings matter: when the final sum is converted
+    to one number, and when this number is divided by n.
 
     **Arguments:**
 
@@ -200,7 +200,7 @@ class _AbstractExtreme(AbstractReduction):
         """Choose the best along the leading axis."""
 
     def init(self, value: PyTree[jax.ShapeDtypeStruct]) -> PyTree[Array]:
-        """Create arrays of the worst numbers of each dtype."""
+        """Create arrays filled with the worst value of their dtype."""
         return jax.tree.map(
             lambda x: jnp.full(x.shape, self._limit(x.dtype), x.dtype),
             _select_structure(self.of, value),
@@ -645,7 +645,7 @@ def _zeros(value: Any) -> Any:
 
 
 def _lifted(value: Any, counts: Bool[Array, ""]) -> Any:
-    """Convert a value to double-double numbers, zeros if the member does not count."""
+    """Convert values to double-double numbers, or to zeros if `counts` is False."""
     return jax.tree.map(
         lambda x: double_double(jnp.where(counts, x, jnp.asarray(0, x.dtype))), value
     )

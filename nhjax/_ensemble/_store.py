@@ -62,8 +62,8 @@ class ZarrSink(AbstractSink):
         resume: bool,
     ):
         self.job, self.given, self.path = job, path, Path(path).absolute()
-        # Only process 0 resolves links: to a process that looks for the folder before
-        # it exists, NFS would report it as missing for up to a minute.
+        # Only process 0 resolves links: if another process looks for the folder before
+        # it exists, NFS reports it as missing for up to a minute.
         if job.processes.index == 0:
             self.path = self.path.resolve()
         self.where = f"The store {str(self.path)!r}"
@@ -122,7 +122,7 @@ class ZarrSink(AbstractSink):
             self.journal.append(line)
 
     def outcome(self) -> EnsembleOutcome:
-        """Finish the journal, label the times if all agree, and create the outcome."""
+        """Finish the journal, store the times if all agree, and return the outcome."""
         processes = self.job.processes
         self.journal.close()
         new = json.dumps([*self.journal.lines.values()]).encode()

@@ -547,7 +547,7 @@ def _attitude(name: str, *geoms: str, **options: Any) -> Looks:
 
 
 def _box_of(moments: Any) -> tuple[str, list[float]]:
-    """Return a marked box with moments of inertia in these ratios, and half lengths."""
+    """Return a marked box for ratios of moments of inertia, and its half lengths."""
     own = np.asarray(moments, float)
     squares = np.maximum(own.sum() / 2 - own, 0.02 * own.sum())
     half = (0.4 * np.sqrt(squares / squares.max())).tolist()
@@ -686,7 +686,7 @@ def _linkage(
     trails: tuple[str, ...] = (),
     **options: Any,
 ) -> Looks:
-    """Return the looks of bars between points, with balls and boxes at some of them.
+    """Return the looks of bars between points, with balls and boxes at some points.
 
     Points with two coordinates are drawn in a vertical plane. `masses` maps the names
     of points to the radii of their balls, divided by the length of the longest bar;

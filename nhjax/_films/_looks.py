@@ -1,8 +1,9 @@
 """The looks of a machine: shapes in MJCF, and the poses of the bodies they belong to.
 
-The functions after the class `Looks` write the shapes of the gallery's machines. In
-these functions, a wheel has its axle along the y axis of its body, and a body that lies
-between two points has its z axis along the line between them.
+The functions after the class `Looks` write the shapes and compute the poses of the
+gallery's machines. In these functions, a wheel has its axle along the y axis of its
+body, and a body that lies between two points has its z axis along the line between
+them.
 """
 
 import math
@@ -236,7 +237,7 @@ def about(axis: str, angle: Any) -> Float[Array, "3 3"]:
 
 
 def flat(point: Array, height: Any = 0.0) -> Float[Array, "3"]:
-    """Return the point in space with the given point (x, y) and height."""
+    """Return the point (x, y, height) in space for a point (x, y) of the plane."""
     return jnp.append(point, jnp.asarray(height, point.dtype))
 
 

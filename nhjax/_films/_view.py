@@ -14,7 +14,7 @@ from ._scene import PLAIN, round_length, Scene, visible_geoms
 
 
 class Show:
-    """A machine in a browser, which `nhjax.view` returns.
+    """The result of `nhjax.view`: a machine in a browser.
 
     - `url`: the address of the page.
     - `server`: the `viser.ViserServer`, to which you can add shapes and controls.
@@ -40,8 +40,8 @@ class Show:
             initial_value=low,
         )
         self._play = server.gui.add_checkbox("play", initial_value=len(times) > 1)
-        # To follow the machine, the ground moves and not the camera, because the user
-        # moves the camera with the mouse.
+        # With "follow", the program moves the ground instead of the camera, because the
+        # user moves the camera with the mouse.
         self._follow = server.gui.add_checkbox("follow", initial_value=True)
         self._follow.on_update(lambda _: self.show(self._slider.value))
         self._slider.on_update(lambda _: self.show(self._slider.value))

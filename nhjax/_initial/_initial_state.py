@@ -107,9 +107,9 @@ def initial_state(
         `coordinates` of the system. If the kept components determine a constraint and
         violate it, the error names the constraint and these components.
     - `throw`: whether to raise if there is no consistent state. If false, all numbers
-        of the returned state are then NaN, and `integrate` reports the state as not
-        finite; under `vmap` the other members of an ensemble are not affected. Wrong
-        types and shapes raise in both cases.
+        of the state returned in this case are NaN, and `integrate` reports the state as
+        not finite; under `vmap` the other members of an ensemble are not affected.
+        Wrong types and shapes always raise.
 
     **Returns:** a `State`.
 
@@ -125,8 +125,8 @@ def initial_state(
     - `ConstraintViolationError`: a constraint is violated, or `q` is not on the group,
         and `project` is false or the kept components prevent the correction.
     - `IrregularLagrangianError`: D2D2L (or D2D2H) is singular.
-    - `DependentConstraintsError`: D2Φ and DΓ do not have full rank (admissibility), and
-        the constraints of the system are `"independent"`.
+    - `DependentConstraintsError`: D2Φ and DΓ together do not have full rank
+        (admissibility), and the constraints of the system are `"independent"`.
     - `IncompatibleConstraintsError`: the compatibility matrix C^{ab} is singular.
     - `NewtonError`: no velocity was found for the momentum (or the reverse), or the
         projection by Newton's method did not converge.
@@ -320,7 +320,7 @@ def _project(
 def _noise(
     system, lin: Linearisation, t, q, u, args
 ) -> tuple[FunctionNoise, Float[Array, "l n"]]:
-    """Measure round-off, and replace rows of D2Φ that are only round-off by zeros.
+    """Measure round-off; set rows of D2Φ and DΓ that are only round-off to zero.
 
     A constraint that is the square of an expression has such a row at states that
     satisfy the constraint. The round-off of a row is measured along one direction,
@@ -340,9 +340,9 @@ def _noise(
 def _allowed(
     system, lin: Linearisation, noise: FunctionNoise, t, q, u, args
 ) -> tuple[Float[Array, " l"], Float[Array, " k"], FloatScalar]:
-    """Bound the violations of velocity and position constraints by round-off.
+    """Bound the violations of velocity and position constraints due to round-off.
 
-    The third number bounds the distance to a group. The round-off is measured, because
+    The third result bounds the distance to a group. The round-off is measured, because
     constants in the constraints can cause larger round-off than q and v if q and v are
     small.
     """
@@ -382,7 +382,7 @@ def _inverse_legendre(
     """Return the u whose fibre derivative is `given`, and whether it was found."""
     zero = jnp.zeros_like(given)
     # If the terms of the equation cancel, as at rest in a magnetic field, the round-off
-    # of u is proportional to these terms and not to u: they give the scale.
+    # of u is proportional to these terms and not to u. Therefore they give the scale.
     terms = jnp.abs(given) + jnp.abs(system.fibre_derivative(t, q, zero, args))
     scale = max_norm(jnp.abs(inverse(system.metric(t, q, zero, args))) @ terms)
     solved = root(

@@ -226,7 +226,8 @@ class Fixed(NamedTuple):
     """The combinations of constraints that the kept components determine.
 
     Row i of `projector` and `slopes` belongs to constraint i, divided by its largest
-    absolute derivative.
+    absolute derivative. The derivatives are with respect to components that are scaled
+    by the metric.
 
     - `sizes`: the largest absolute derivative of each constraint, 1 if all are zero.
     - `projector`: the projector onto the combinations that are constant, to first
@@ -243,7 +244,7 @@ class Nearest(NamedTuple):
     """The result of a search for the nearest point on a constraint.
 
     - `x`: the point at which the search ended, a vector or an element of the group.
-    - `found`: whether the search converged.
+    - `found`: whether the search succeeded.
     - `jacobian`: the Jacobian of the constraint at the start of the search.
     - `fixed`: the combinations of constraints that the kept components determine; None
         if no components are kept.
@@ -396,9 +397,9 @@ def _left_basis(
 ) -> tuple[Float[Array, "l l"], Float[Array, " l"]]:
     """Find orthonormal combinations of rows, and which combinations are active.
 
-    The combinations are the columns of the first result. The second result has a one
-    for each active combination, whose singular value exceeds `negligible`, and a zero
-    for each other combination.
+    The combinations are the columns of the first result. A combination is active if its
+    singular value exceeds `negligible`. The second result is 1 for active combinations
+    and 0 for the others.
     """
     missing = jnp.zeros(max(matrix.shape[0] - matrix.shape[1], 0), matrix.dtype)
     left, singular, _ = jnp.linalg.svd(matrix)

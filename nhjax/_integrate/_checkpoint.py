@@ -43,8 +43,8 @@ class Checkpoint(eqx.Module):
     - `dt`: the step size.
     - `num_steps`: the number of steps taken since `t0`.
     - `clock`: the data of the `stepsize_controller`; empty after a run with constant
-        steps. After a run with variable steps, `t0` is the end of the run, and
-        `num_steps` is zero.
+        steps. After a run with variable steps, `t0` is the time at the end of the run,
+        and `num_steps` is zero.
 
     Under `vmap` every array has the batch as its leading axis. Derivatives pass through
     `state`, `t0` and `dt`.
@@ -221,8 +221,8 @@ def _agree(old: Linearisation, new: Linearisation) -> BoolScalar:
         )
     ]
     # The bound is far above eps, because an ill-conditioned inverse has few correct
-    # digits. If the differences are below the bound, the stage solver converges as well
-    # with the Jacobian of the checkpoint as with a fresh Jacobian.
+    # digits. If the differences are below the bound, the stage solver converges equally
+    # well with the Jacobian of the checkpoint and with a fresh Jacobian.
     small = float(jnp.finfo(pairs[0][0].dtype).eps) ** 0.25
     close = [max_norm(x - y) <= small * (max_norm(x) + max_norm(y)) for x, y in pairs]
     return jnp.all(jnp.stack(close))

@@ -5,7 +5,7 @@ chunk of steps. It computes the loop carry after the chunk from the loop carry b
 it, and writes the output of the steps to the rows of a buffer of fixed size. Its
 arguments include the first step, the number of steps and the stride of the output,
 which is the number of steps from one saved state to the next. A run of another length
-or with other output therefore does not recompile. Between chunks the host moves the
+or with another stride therefore does not recompile. Between chunks the host moves the
 rows to the output, updates the progress meter, and stops the run after Ctrl-C.
 """
 

@@ -90,8 +90,8 @@ def named_arrays(value: Any, batch: tuple[str, ...]) -> dict[str, Any]:
     `t` and the codes of `Solution.result` in `result`. Arrays of another tree are named
     by their paths.
 
-    **Returns:** a dictionary from names to pairs of the dimensions, starting with
-    `batch`, and the array.
+    **Returns:** a dictionary from names to pairs (dimensions, array). The dimensions
+    start with `batch`.
     """
     # A `Solution` is recognised by its `stats`. Its class cannot be imported here,
     # because its module imports this module.

@@ -45,7 +45,7 @@ class TimeGrid(eqx.Module):
 class VariableGrid(eqx.Module):
     """The nodes of a run with variable steps, that is, steps of different sizes.
 
-    - `dt`: the step size that the user gave (of an array, the first), or None.
+    - `dt`: the step size that the user gave (the first one of an array), or None.
     - `t1`: the end, or None for a run of `num_steps` steps.
     - `direction`: 1.0 for a run forward in time, -1.0 for a run backward in time.
     - `num_steps`: the number of steps, or None for a run to `t1`.

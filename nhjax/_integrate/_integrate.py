@@ -342,8 +342,8 @@ def integrate(
         message = _INTERRUPTED.format(f"{done}{of}", float(sol.t1))
         warnings.warn(message, stacklevel=2)
     if not _is_tracing() and has_default_jacobian(used):
-        # This comes before errors are raised, because unsolved steps can be the reason
-        # why a run did not reach its end.
+        # The warning comes before errors are raised, because unsolved steps can be the
+        # reason why a run did not reach its end.
         _warn_of_iterations(sol, system, t0, state, args)
     if throw and (_is_tracing() or not ended_as(sol, "interrupted")):
         _require_constraints(sol, system, t0, state, args)
@@ -401,7 +401,7 @@ def step(
         constant during the step.
     - `stage_solver`: `nhjax.SimplifiedNewton()` by default, or `nhjax.Newton()`.
     - `throw`: whether to raise an error if the step cannot be solved. If false, all
-        numbers of the returned state are then NaN.
+        numbers of the state returned in this case are NaN.
     - `invariants`: quantities that the step conserves, as for `nhjax.integrate`.
 
     **Returns:** the `State` at `t + dt`.

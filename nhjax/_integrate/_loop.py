@@ -356,7 +356,7 @@ def _run_until_over(arguments: tuple[Loop, _Run], adjoint: AbstractAdjoint) -> _
 
 @_run_until_over.def_jvp
 def _run_until_over_jvp(primals, tangents):
-    # Reverse mode needs a loop of known length: iterations after the end are idle.
+    # Reverse mode needs a loop of known length. Iterations after the end are no-ops.
     arguments, adjoint = primals
     rates, _ = tangents
 

@@ -465,7 +465,8 @@ def run_in_chunks(
     saves_start = jax.device_put(np.array(saveat.t0))
     start = _started(*given, saves_start, captured=captured)
     if not all(isinstance(x.dtype, np.dtype) for x in jax.tree.leaves(start.saved)):
-        # NumPy has no arrays of random keys: a run that saves keys is one program.
+        # NumPy has no arrays of random keys. Therefore a run that saves keys is one
+        # program.
         return run(system, method, y0, whole, args, options, saveat, solver_options)
 
     def chunk(carry: AbstractCarry, log: Any, span: Array) -> _Chunk:
@@ -695,7 +696,7 @@ def _padded_output(
         pieces.append(_one(first))
     last = _one(saving.saved(end.t, end.state, args)) if saveat.t1 else None
     if saveat.steps:
-        # The extra row of the buffers receives the output at the end of the run.
+        # The extra row of the buffers leaves room for the output at the end of the run.
         rows = jnp.arange(saving.num_saved + 1, dtype=jnp.int32)
         count = number // saveat.steps
         padded_rows = _infinite_unless(rows < count, saved)

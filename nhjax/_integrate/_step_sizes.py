@@ -483,8 +483,8 @@ class PIDController(AbstractStepSizeController):
             jnp.asarray(x, dtype) for x in (self.factormin, self.factormax, self.safety)
         )
         estimate = jnp.where(is_known, error, jnp.inf)
-        # Sums of logarithms take less time than products of powers. The logarithm of
-        # the error is raised to at least `bound`, which already gives the largest
+        # Sums of logarithms take less time than products of powers. A logarithm of the
+        # error below `bound` is replaced by `bound`, which already gives the largest
         # factor.
         bound = number * jnp.log(safety / most)
         error = jnp.log(jnp.maximum(error, float(jnp.finfo(dtype).tiny)))

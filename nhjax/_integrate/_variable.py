@@ -74,7 +74,7 @@ class StepSizes(eqx.Module):
     """How a run chooses the sizes of its steps, and where the run ends.
 
     - `t1`: the end of the run, or None for a run of `num_steps` steps.
-    - `max_steps`: the largest number of attempts at a step.
+    - `max_steps`: the largest number of attempted steps in the run.
     """
 
     controller: AbstractStepSizeController
@@ -288,7 +288,7 @@ class VariableStepper(AbstractStepper[VariableCarry, StepLogEntry]):
         clock = sizes.after(
             clock, end, step, accepted, size, decision.memory, stats["num_steps"]
         )
-        # The run fails if its last attempt has not reached the end.
+        # The run fails if its last allowed attempt has not reached the end.
         i = jnp.asarray(i, jnp.int32)
         spent = alive & ~failed & ~clock.is_done & (i + 1 >= sizes.max_steps)
         result = RESULTS.where(spent, RESULTS.max_steps_reached, result)

@@ -30,9 +30,10 @@ class AbstractLieGroup(eqx.Module):
     momenta are left-trivialised: they are vectors of 𝔤 and 𝔤*.
 
     To define your own group, write a subclass with `dim`, `identity`, `check`,
-    `compose`, `inverse`, `retract` and `local`. All other methods follow from these by
-    automatic differentiation, and can be overridden with closed forms. An element is a
-    pytree of arrays. The retraction must satisfy τ(0) = e and dτ_0 = I.
+    `compose`, `inverse`, `retract` and `local`. All other methods, except `matrix` and
+    `hat`, follow from these by automatic differentiation, and can be overridden with
+    closed forms. An element is a pytree of arrays. The retraction must satisfy τ(0) = e
+    and dτ_0 = I.
     """
 
     @property
@@ -133,7 +134,10 @@ class AbstractLieGroup(eqx.Module):
     def advance_across(
         self, q: Element, xi: Vector, compensation: Element
     ) -> tuple[Element, Element]:
-        """Compute q τ(-ξ)⁻¹ τ(ξ), from -ξ to ξ in the chart, and its compensation."""
+        """Compute q τ(-ξ)⁻¹ τ(ξ) and its compensation.
+
+        In the chart, q moves from -ξ to ξ.
+        """
         return self.advance(self.act_back(q, -xi), xi, compensation)
 
     def tangent(self, g: Element, eta: Vector) -> Element:
@@ -160,8 +164,8 @@ class AbstractLieGroup(eqx.Module):
 
         It is defined by ∂_ξ(dτ_ξ η) δ = dτ_ξ ddτ_ξ(η, δ).
         """
-        # Differentiate dτ_ξ⁻¹ y = η at y = dτ_ξ η. The inverse is simpler than dτ: for
-        # the Cayley map it is a polynomial.
+        # For fixed y = dτ_ξ η, the derivative of dτ_ξ⁻¹ y along δ is -ddτ_ξ(η, δ). The
+        # inverse is simpler than dτ: for the Cayley map it is a polynomial.
         y = self.dtau(xi, eta)
         return -_jvp(lambda z: self.dtau_inv(z, y), xi, delta)
 

@@ -237,7 +237,7 @@ class SE2(AbstractMotionGroup):
         return jnp.concatenate([v, rate])
 
     def wrapped(self, q: Pose, compensation: Pose) -> Pose:
-        """Return the pose with its angle reduced to between -π and π."""
+        """Return the pose with the equivalent angle between -π and π."""
         return jnp.concatenate([q[:2], wrapped_angle(q[2:], compensation[2:])])
 
     def advance(self, q: Pose, xi: Twist, compensation: Pose) -> tuple[Pose, Pose]:
@@ -286,7 +286,7 @@ class SE2(AbstractMotionGroup):
         return jnp.concatenate([linear, (alpha + gamma * s) * eta[2:]])
 
     def Ad(self, g: Pose, eta: Twist) -> Twist:
-        """Compute Ad_g η = (R(θ) u - σ J x, σ) for η = (u, σ)."""
+        """Compute Ad_g η = (R(θ) u - σ J x, σ) for g = (x, θ) and η = (u, σ)."""
         linear = rotate(g[2], eta[:2]) - eta[2] * quarter_turn(g[:2])
         return jnp.concatenate([linear, eta[2:]])
 
@@ -379,9 +379,9 @@ def wrapped_angle(
     """Return angle + compensation - 2πk, with the integer k nearest to angle / 2π.
 
     The result is accurate to the round-off of one turn if k fits into half of the bits
-    of the mantissa. The number 2πk is subtracted in parts that are short enough for
-    their products with k to be exact (Cody and Waite, *Software Manual for the
-    Elementary Functions*, 1980).
+    of the mantissa. 2π is split into three parts, and k times each part is subtracted.
+    The first two parts have so few bits that these products are exact (Cody and Waite,
+    *Software Manual for the Elementary Functions*, 1980).
     """
     dtype = np.dtype(angle.dtype)
     bits = jnp.finfo(dtype).nmant + 1

@@ -167,7 +167,7 @@ class Exponential(AbstractRetraction):
         self, w: FloatScalar, v: Float[Array, "3"]
     ) -> Float[Array, "3"]:
         """Compute ω = 2 arctan(|v|/w) v/|v|, from tan(|ω|/4) = |v|/(1 + w)."""
-        # The quaternions q and -q are the same rotation: use the one with shorter ω.
+        # The quaternions q and -q are the same rotation. Use the one with shorter ω.
         sign = jnp.where(w < 0, -1.0, 1.0).astype(w.dtype)
         v, w = sign * v, 1 + sign * w
         return 4 * arctan_ratio(jnp.sum(v**2) / w**2) / w * v

@@ -465,7 +465,7 @@ _CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)
 
 
 def _product_tensor() -> np.ndarray:
-    """Build the coefficients (1_j ∘ 1_k)_i of the products of 1, i, j and k."""
+    """Build T_ijk = (e_j ∘ e_k)_i, where e_0..e_3 are the quaternions 1, i, j, k."""
     tensor = np.zeros((4, 4, 4))
     tensor[0] = np.diag([1.0, -1.0, -1.0, -1.0])
     tensor[1:, 0, 1:] = tensor[1:, 1:, 0] = np.eye(3)

@@ -1,7 +1,7 @@
 """Order conditions, hypotheses, symmetry and stability of a tableau.
 
 The simplifying assumptions B, C and D are due to Butcher (Hairer, Lubich, Wanner,
-"Geometric Numerical Integration", II.1). The mixed assumption CĈ is due to L. Jay
+"Geometric Numerical Integration", II.1), and the mixed assumption CĈ is due to L. Jay
 ("Symplectic partitioned Runge-Kutta methods for constrained Hamiltonian systems", SIAM
 J. Numer. Anal. 33, 1996):
 
@@ -18,7 +18,7 @@ the edge to τ_k selects a matrix a^(k), which is a or â. With
 
     Σ_i b_i φ_i(τ) = 1 / γ(τ),    γ(τ) = |τ| Π_k γ(τ_k),
 
-for all trees τ with up to p vertices (ibid., III.2.2).
+for all trees τ with |τ| <= p vertices (ibid., III.2.2).
 """
 
 import math
@@ -116,9 +116,9 @@ def order(t: Tableau) -> int:
     """Find the order of the pair (a, â) in systems without constraints.
 
     The conditions of trees are checked in float64 to 1e-12. If all conditions up to
-    order 8 hold, the order is min(p, 2r + 2) with the largest p and r for which B(p)
-    and D(r) hold. This is the order of Gauss and Lobatto methods; for other tableaux,
-    measurements confirm it.
+    order 8 hold, the order is min(p, 2r + 2), but at least 8, with the largest p and r
+    for which B(p) and D(r) hold. This is the order of Gauss and Lobatto methods; for
+    other tableaux, measurements confirm it.
     """
     found = partitioned_order((t.a, t.a_hat), t.b, 1e-12, _MAX_TREE_ORDER)
     if found < _MAX_TREE_ORDER:
@@ -210,7 +210,7 @@ def stability_at_infinity(t: Tableau) -> float:
 class _Branch(NamedTuple):
     """A tree τ that is joined to a new root by an edge of one of the two colours.
 
-    The fields are |τ|, γ(τ) and Σ_j a_ij φ_j(τ), or with â for the other colour.
+    The fields are |τ|, γ(τ) and Σ_j m_ij φ_j(τ), with m = a or m = â by the colour.
     """
 
     size: int

@@ -31,7 +31,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 
-# There are no static types: mpmath creates its classes for each context.
+# mpmath has no static types, because it creates its classes for each context.
 Number: TypeAlias = Any
 Matrix: TypeAlias = Any
 
@@ -62,7 +62,7 @@ class Tableau:
 
     The fields hold mpmath numbers: `mp_a` is an s x s matrix, `mp_b` and `mp_c` are
     lists. An order condition or other identity counts as satisfied if its defect is at
-    most `tolerance`. This is a bound on the round-off of 60 digits for built-in
+    most `tolerance`. The tolerance bounds the round-off of 60 digits for built-in
     tableaux, and of float64 for a user's tableau. Instances compare and hash by
     identity; the functions that create them are cached.
     """
@@ -152,7 +152,7 @@ def _collocation(points: list[Number]) -> Tableau:
     for i in range(s):
         for j in range(s):
             # In exact arithmetic a_ij equals its reflection b_j - a_{s+1-i,s+1-j}. The
-            # average of both is exactly symmetric.
+            # average of both has this symmetry exactly.
             a[i, j] = (raw[i, j] + b[j] - raw[s - 1 - i, s - 1 - j]) / 2
     if points[0] == -1:
         # The integrals to c_1 = 0 and c_s = 1 are known exactly.
@@ -414,7 +414,7 @@ def integrated_lagrange(t: Tableau, theta: ArrayLike) -> Float[Array, "*batch s"
     linear = _combine([fraction], coefficients[:1])
     if t.stages == 1:
         return linear
-    # P_1', P_2', ... are Gegenbauer polynomials C^(3/2), which have this recurrence.
+    # P_1', P_2', ... are Gegenbauer polynomials C^(3/2); the loop is their recurrence.
     d = [jnp.ones_like(x), 3 * x]
     for n in range(2, t.stages - 1):
         d.append(((2 * n + 1) * x * d[n - 1] - (n + 1) * d[n - 2]) / n)

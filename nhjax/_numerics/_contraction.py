@@ -106,8 +106,8 @@ def _evaluated(program, consts, args):
         else:
             primitive = equation.primitive
             bound = primitive.get_bind_params(params)
-            # Earlier releases of JAX return functions separately from the other
-            # parameters.
+            # In earlier releases of JAX, `get_bind_params` returns functions separately
+            # from the other parameters.
             functions, params = bound if isinstance(bound, tuple) else ((), bound)
             out = primitive.bind(*functions, *inputs, **params)
             out = out if primitive.multiple_results else [out]

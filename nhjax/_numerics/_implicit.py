@@ -32,8 +32,8 @@ _UNITS_LEFT = 256
 # `root` divides its `path` into `_PARTS_OF_PATH` parts, with `_ITERATIONS_OF_PART`
 # iterations in each part.
 _PARTS_OF_PATH, _ITERATIONS_OF_PART = 32, 3
-# If these terms stop falling above this many units of round-off, their sum does not
-# converge. The derivative is then NaN rather than a wrong number.
+# If the terms of `solve_contraction` stop falling above this many units of round-off,
+# their sum does not converge. The derivative is then NaN rather than a wrong number.
 _NOISIEST = 1e4
 
 T = TypeVar("T")
@@ -301,7 +301,7 @@ class ClosureConverted(eqx.Module):
     """A traced function as a tree, whose leaves are the arrays that it closes over.
 
     A function with a custom rule of derivatives is differentiated only with respect to
-    its arguments. If an argument is an instance of this class, it is also
+    its arguments. If an argument is an instance of this class, the function is also
     differentiated with respect to the arrays that the instance closes over.
     `equinox.filter_closure_convert` does the same, but it refuses arrays whose sharding
     differs inside and outside of `jax.shard_map`.

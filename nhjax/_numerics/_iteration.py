@@ -34,10 +34,10 @@ _HOPELESS = 1e6
 _LARGEST_NOISE = 1e5
 # Convergence counts as slow after more than this many iterations.
 _SLOW = 100
-# If convergence is slow, the last allowed increment is treated as noise up to this
-# many times the measured noise. Near positions at which constraints become dependent,
-# increments have been seen to vary between 5 and 19 times the noise without falling
-# further.
+# If convergence is slow, the increment of the last allowed iteration is treated as
+# noise up to this many times the measured noise. Near positions at which constraints
+# become dependent, increments have been seen to vary between 5 and 19 times the noise
+# without falling further.
 _LAST_UNITS = 32.0
 
 

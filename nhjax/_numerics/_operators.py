@@ -462,8 +462,8 @@ def jacobian_by_rows(
 
 def _unit_vectors(u: Float[Array, " n"]) -> Float[Array, "n n"]:
     # The rows are padded, because `nhjax.lanes` omits products with zeros that pad an
-    # array. It could not omit products with the zeros of `jnp.eye`, because the other
-    # factor may be infinite.
+    # array, even if the other factor may be infinite. It must keep products with the
+    # zeros of `jnp.eye`.
     n, one, zero = u.shape[0], jnp.ones((1,), u.dtype), jnp.zeros((), u.dtype)
     rows = [jax.lax.pad(one, zero, [(k, n - 1 - k, 0)]) for k in range(n)]
     return jnp.stack(rows)
@@ -647,7 +647,7 @@ def block_tridiagonal_inverse(
 
 # Elements of an array at places that are known when the program is traced.
 
-# An array is not composed of more slices than this, because the program would be long.
+# An array is composed of at most this many slices, to keep the program short.
 _MOST_PIECES = 16
 _PERIODS = (1, 2, 3, 4, 6)
 

@@ -501,7 +501,7 @@ class RollingGeom(NamedTuple):
     is_parameter: bool
 
     def has_radius(self, model: Any) -> bool:
-        """Return whether the geom has a radius; an ellipsoid has three semi-axes."""
+        """Return whether the geom has a radius; ellipsoids have semi-axes instead."""
         ellipsoid = mujoco().mjtGeom.mjGEOM_ELLIPSOID
         return model.geom_type[self.geom] != int(ellipsoid)
 
@@ -714,10 +714,10 @@ def _ground(model: Any, layout: Layout, ground: Any) -> AbstractGround:
 def _height_varies(
     model: Any, geom: int, ground: AbstractGround, name: str, moving: Sequence[str]
 ) -> bool:
-    """Return whether the joints can change the height of a geom above the ground.
+    """Return whether the height of a geom above the ground can change.
 
-    The positions of the bodies named in `moving` can change too. Raise if the height is
-    constant and not zero.
+    The joints and the positions of the bodies named in `moving` can change it. Raise if
+    the height is constant and not zero.
     """
     if not isinstance(ground, Plane):
         return True
@@ -807,8 +807,8 @@ class _Rows:
         self.evaluate = jax.jit(self._evaluate)
 
     def _positions(self, q: PyTree[Array], args: Args) -> Array:
-        # `independent_rows` keeps the first of dependent rows. Constraints on positions
-        # come first, so that a dependent constraint on velocities is left out.
+        # `independent_rows` leaves out rows that follow from earlier rows. Constraints
+        # on positions come first, so that constraints on velocities are left out.
         rows = [x.height(0.0, q, args)[None] for x in self.heights]
         if self.loop is not None:
             rows.append(self.loop(0.0, q, args))

@@ -96,7 +96,7 @@ class Parameters(eqx.Module):
         joints or geoms to their places in the arrays. For positions and radii these are
         places in MuJoCo's model, and are not used here.
     - `controls`: the names of the actuators, or None if a function that the user passed
-        computes the controls: `args["controls"]` may then have any structure.
+        computes the controls. With None, `args["controls"]` may have any structure.
     """
 
     names: dict[str, dict[str, tuple[int, ...]]] = eqx.field(static=True)

@@ -31,7 +31,8 @@ class Joint(NamedTuple):
 
     - `name`, `kind`: the kind is "free", "ball", "slide" or "hinge".
     - `parent`: the number of the joint before it on the path from the world, or -1.
-    - `offset`: the frame of its body at rest, relative to the frame after `parent`.
+    - `offset`: the frame of its body at rest, relative to the frame that
+        `parent` moves.
     - `anchor`, `axis`: the point and the direction of the joint in its own frame.
     - `reference`: the coordinate of a slide or a hinge at rest.
     - `shifts`: the parameters that move the origin of `offset`.

@@ -91,7 +91,7 @@ def compile_model(
 
 
 def _add_motors(spec: Any, motors: Sequence[str]) -> None:
-    """Add a motor with the gear 1 to each of these joints."""
+    """Add a motor with the gear 1 to each joint in `motors`."""
     library = mujoco()
     joints = {joint.name: joint for joint in spec.joints}
     scalar = library.mjtJoint.mjJNT_HINGE, library.mjtJoint.mjJNT_SLIDE
@@ -273,7 +273,8 @@ def has_flag(model: Any, name: str) -> bool:
 class Unsupported(NamedTuple):
     """A part of a model that nhjax does not support.
 
-    `category` is the word in `ignore` that leaves it out, or None if there is none.
+    `category` is the word in `ignore` that leaves the part out, or None if there is no
+    such word.
     """
 
     category: str | None

@@ -280,7 +280,8 @@ def from_mujoco(
         and an ellipsoid roll in all directions. The geoms in `rolling` can never lift
         off.
     - `ground`: the name of a plane that is fixed to the world, or a ground of
-        `nhjax.rolling`. The default is the only plane of the model, or z = 0.
+        `nhjax.rolling`. The default is the only plane of the model, or z = 0 if the
+        model has no plane.
     - `root`: for a URDF file, how the root link can move. `"free"` adds a free joint,
         and `"planar"` the coordinates x, y and heading. `"fixed"` leaves it fixed to
         the world, as MuJoCo does.
@@ -439,8 +440,8 @@ _FOLDER = Path(__file__).parent / "models"
 _LEFT_ROLLERS, _RIGHT_ROLLERS = -math.pi / 4, math.pi / 4
 # The right front wheel of the car may slip sideways, because a steering trapezoid does
 # not turn both front wheels exactly about one centre. The right wheels of the quadruped
-# may slip sideways too: when all wheels are parallel, their lateral constraints would
-# repeat the lateral constraints of the left wheels.
+# may slip sideways too: when all wheels are parallel, the right wheels would repeat the
+# lateral constraints of the left wheels.
 _OPTIONS: Mapping[str, tuple[str, dict[str, Any]]] = MappingProxyType(
     {
         "ackermann_car": (

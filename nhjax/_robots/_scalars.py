@@ -19,7 +19,7 @@ Entry: TypeAlias = Any
 Vector: TypeAlias = list[Entry]
 Matrix: TypeAlias = list[Vector]
 
-# After rounding, a rotation by a right angle has entries of this size instead of zeros.
+# Due to round-off, a rotation by a right angle has entries below this size, not zeros.
 _NOISE = 1e-15
 
 

@@ -1,10 +1,10 @@
 """The kinematic tree of a robot: its joints, its configuration space and its poses.
 
-Each joint is a node of the tree. The recursions from the world to the ends of the tree
-treat all nodes at the same depth together. The number of operations in the program
-therefore grows with the depth, not with the number of joints: all legs of a robot cost
-no more operations than one leg. The programs of small trees compute single entries
-instead of arrays, because most entries of their frames are zero.
+Each joint is a node of the tree. In large trees, the recursions from the world to the
+ends of the tree treat all nodes at the same depth together. The number of operations in
+the program therefore grows with the depth, not with the number of joints: all legs of a
+robot cost no more operations than one leg. The programs of small trees compute single
+entries instead of arrays, because most entries of their frames are zero.
 """
 
 from collections.abc import Sequence

@@ -325,7 +325,7 @@ class MiddleChart(AbstractCurvedChart):
         return -self._half, self._half
 
     def coordinates(self, increment: Vectors) -> Vectors:
-        """Compute the coordinates y = Ξ - ξ/2 of the points that Ξ reach from g_k."""
+        """Compute the coordinates y = Ξ - ξ/2 that belong to the increments Ξ."""
         return increment - self._half[None]
 
     def momentum_at_origin(self, momentum: Vector) -> Vector:

@@ -62,8 +62,8 @@ class StageUnknowns(eqx.Module):
     - `end_acceleration`, `end_multiplier`: u̇ and λ_c, the acceleration and multiplier
         of the continuous equations at the end of the step; only the symmetric closure
         has these unknowns.
-    - `impulse`: ε, the impulses at both ends of the step along ∂I/∂v of the invariants
-        I; None if the run keeps no invariants.
+    - `impulse`: ε, the factors of the impulses ε ω at both ends of the step, with ω
+        from `Directions`; None if the run keeps no invariants.
     """
 
     velocity: Float[Array, "s n"]
@@ -459,7 +459,7 @@ def end_residual(
 ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
     """Compute the residuals of the equations of motion at the end of the step.
 
-    They vanish for the acceleration and the continuous multiplier λ_c at the end.
+    They vanish if `x` has the acceleration and the continuous multiplier λ_c there.
     """
     on_momentum, hidden = motion_residual(
         stages.system,
@@ -543,7 +543,7 @@ def end_impulse(stages: StageEquations, x: StageUnknowns) -> Float[Array, " n"]:
 def end_slopes(
     stages: StageEquations, x: StageUnknowns
 ) -> tuple[Float[Array, "k n"], Float[Array, "k n"]]:
-    """Compute ∂I/∂u and ω of the invariants at the end of a step; see `Directions`."""
+    """Compute the slopes and covectors of `Directions` at the end of a step."""
     assert stages.invariants is not None
     found = stages.invariants.functions.directions(*_end_point(stages, x))
     return found.slopes, found.covectors

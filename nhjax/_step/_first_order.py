@@ -258,8 +258,8 @@ class _BodySlopes(NamedTuple):
 class _ChartSlopes(NamedTuple):
     """Derivatives at the start of a step, in its chart.
 
-    - `turning`: the rate of ∂Π/∂H if only y changes, at the rate u, and with it dτ_y,
-        the derivative of the retraction.
+    - `turning`: the rate of ∂Π/∂H that the change of dτ_y, the derivative of the
+        retraction, causes if y changes at the rate u.
     - `momentum`, `force`, `body_force`: ∂Π/∂y, ∂F/∂H and ∂w/∂H.
     - `base`: the derivative of `AbstractChart.base_momentum`, the constant term of Π,
         with respect to the increment ξ of the step.

@@ -161,7 +161,7 @@ class LinearisedStep(eqx.Module):
         x: StageUnknowns,
         reaction: Float[Array, "s n"],
     ) -> StageResponses:
-        """Compute the changes / h that given reactions cause at stages and nodes."""
+        """Compute the changes, divided by h, of stages and nodes due to reactions."""
         on_stages, on_nodes = momenta_of_forces(stages, x, reaction[..., None])
         on_stages, on_nodes = on_stages[..., 0], on_nodes[..., 0]
         velocity, momentum = self.of_stages(stages, on_stages)
@@ -235,7 +235,7 @@ def slopes(
             )
         )
 
-    # This is a loop over the directions, so that the program has one copy of the
+    # `mapped` is a loop over the directions, so that the program has one copy of the
     # linearised function.
     found = mapped(along, jnp.eye(sum(sizes), dtype=args[0].dtype))
     # A derivative can be infinite or NaN, such as the derivative of |v| at rest. It is

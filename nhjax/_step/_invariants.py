@@ -29,10 +29,10 @@ from .._system import (
 # there may be no impulse that corrects the error, this limit is small.
 _LARGEST_PART = 0.1
 # An impulse ε ω, with ω from `Directions`, changes I by ε ω·M⁻¹ω. With an indefinite
-# mass matrix M, ω·M⁻¹ω can vanish although ω does not. If it is less than this fraction
-# of its bound Σ_ij |M⁻¹_ij| ω_i², a step has no impulse. All other impulses are at most
-# 1 / 0.03 times as large as with a definite matrix that attains the bound. Fractions
-# from 0.01 to 0.3 gave the same largest errors of test motions.
+# mass matrix M, ω·M⁻¹ω can vanish although ω does not. If |ω·M⁻¹ω| is less than this
+# fraction of its bound Σ_ij |M⁻¹_ij| ω_i², a step has no impulse. All other impulses
+# are at most 1 / 0.03 times as large as with a definite matrix that attains the bound.
+# Fractions from 0.01 to 0.3 gave the same largest errors of test motions.
 LEAST_PART = 0.03
 
 
@@ -272,7 +272,8 @@ class InvariantCorrection(eqx.Module):
         which cannot cancel.
     - `start`, `end`: N⁻¹ ω at both ends, the derivative of u with respect to ε.
     - `velocity`: M⁻¹ ω at the start, the derivative of velocities with respect to ε.
-    - `noise`: the round-off of u that the round-off of the invariants causes.
+    - `noise`: the round-off of u that the round-off of the invariants causes, divided
+        by the unit round-off.
     """
 
     errors: Float[Array, " k"]

@@ -91,9 +91,9 @@ def simplified_newton_update(
     x_next = factors.correct_nodes(stages, x_next, r_nodes, change)
     if stages.invariants is not None:
         # The impulses are corrected first, so that the constraints are evaluated with
-        # the velocities after this change. In the other order, the multipliers would
-        # ignore these changes, on which the reactions do work. In a system nearly at
-        # rest this work is not negligible.
+        # the corrected velocities. In the other order, the multipliers would ignore
+        # this correction, along which the reactions do work. In a system nearly at rest
+        # this work is not negligible.
         error = invariant_errors(stages, x_next)
         x_next = factors.correct_impulses(stages, x_next, error)
     if factors.full is not None:
@@ -103,20 +103,20 @@ def simplified_newton_update(
         kinematic, holonomic = constraint_values(stages, x_next)
         x_next = factors.correct_multipliers(stages, x_next, kinematic, holonomic)
     if stages.end_multiplier_is_unknown:
-        # λ_c at the end depends on v_{k+1} at zeroth order in h: it must be corrected
-        # with the new velocity. Otherwise the errors of λ_c and v_{k+1} add to each
-        # other, and an iteration reduces them only by the square root of the usual
-        # factor.
+        # λ_c at the end depends on v_{k+1} at zeroth order in h, so that it must be
+        # corrected with the new velocity. Otherwise the errors of λ_c and v_{k+1} add
+        # to each other, and an iteration reduces them only by the square root of the
+        # usual factor.
         x_next = factors.correct_end(stages, x_next, end_residual(stages, x_next))
     return x_next, Evaluation(forces, r_nodes, jnp.asarray(False))
 
 
 class MultiplierResponses(NamedTuple):
-    """The changes of stages and nodes by a unit change of each multiplier unknown.
+    """The changes of stages and nodes per unit change of each multiplier unknown.
 
     The last axis lists these unknowns: h δy and h δΛ, the changes of `closure` and
-    `holonomic` in `StageUnknowns` times h. The responses are stored only with the terms
-    of order h, where they give the Schur complement.
+    `holonomic` in `StageUnknowns` times h. The responses are stored only if the terms
+    of order h are used; they then give the Schur complement.
     """
 
     velocity: Float[Array, "s n c"]
@@ -131,8 +131,8 @@ class FullFactors(eqx.Module):
 
     The unknowns for the multipliers are h δy and h δΛ, the changes of `closure` and
     `holonomic` in `StageUnknowns` times h. With the symmetric closure there is also
-    h δλ_c, with the continuous multiplier λ_c at the end of the step. A change h δλ_c
-    includes the change of y that leaves the nodes unchanged to leading order.
+    h δλ_c, where λ_c is the continuous multiplier at the end of the step. A change
+    h δλ_c includes the change of y that leaves the nodes unchanged to leading order.
     """
 
     step: LinearisedStep
@@ -344,8 +344,8 @@ class StageJacobianFactors(eqx.Module):
     """A part of the Jacobian of the stage equations of one step, factorised.
 
     `Linearisation` defines N, K and B. With N and K at the start of the step, B_i at
-    the nodes of given stages, R the `node_rows` of a_ij, the residuals r and the change
-    δΛ of all multipliers, the fibre coordinates change by
+    the nodes of given stages, R_ij the `node_rows` of a_ij, the residuals r and the
+    change δΛ of all multipliers, the fibre coordinates change by
 
     δu_i = -N⁻¹ r_u + h Σ_j â_ij K⁻¹ B_jᵀ δΛ_j        (stages),
     δu_i = -N⁻¹ r_v + h Σ_j R_ij K⁻¹ B_jᵀ δΛ_j        (nodes).
@@ -354,9 +354,9 @@ class StageJacobianFactors(eqx.Module):
     the positions, and B_s δu_s = -r for the rate of the holonomic constraints at the
     end of the step. These three conditions give a Schur complement for the unknowns
     h δy of the closure and h δΛ of the holonomic constraints. For small h this matrix
-    is invertible by hypothesis H2 and the compatibility condition. With the symmetric
-    closure, it is invertible only for one sign of the unknown ν in the last multiplier;
-    see `docs/closures.md`.
+    is invertible by hypothesis H2 and the compatibility condition. The symmetric
+    closure adds ±ν, with an unknown ν, to the last multiplier. The matrix is invertible
+    for only one of these signs; see `docs/closures.md`.
 
     With `first_order`, the terms of order h are added to N⁻¹ r. The changes that
     multipliers cause are then stored as `responses`, which include these terms.
@@ -434,7 +434,7 @@ class StageJacobianFactors(eqx.Module):
                 holonomic=x.holonomic + h_dholonomic / stages.h,
             )
         h_dlambda = stages.free_multipliers(h_dy, h_dholonomic)
-        # This is h K⁻¹ Bᵀ δΛ; only the multipliers need a division by h.
+        # `push` is h K⁻¹ Bᵀ δΛ; only the multipliers need a division by h.
         push = self.reaction.matvec(h_dlambda)
         a_hat, momentum = stages.coefficients("a_hat"), x.momentum
         velocity_push = push
@@ -566,7 +566,7 @@ def _dense_factors(
     lin: Linearisation,
     jacobian: Float[Array, "s l n"],
 ) -> StageJacobianFactors:
-    """Compute the factors with the Jacobians B of the constraints at all stages."""
+    """Compute the factors from the Jacobians B of the constraints at all stages."""
     reaction = (
         DenseMatrix(jacobian).weighted_transpose(lin.fibre_hessian_inverse).entries
     )
@@ -776,7 +776,7 @@ def full_factors(
         _, dlam = _end_change(end, end_by, xi, at_nodes[-1])
         return response, jnp.concatenate([-h * dlam[:m], change])
 
-    # This is a loop over the multipliers, so that the program stays short.
+    # `mapped` loops over the multipliers, so that the program stays short.
     forces = jnp.moveaxis(pushes, 2, 0)
     found, columns = mapped(column, forces)
     responses = jax.tree.map(lambda z: jnp.moveaxis(z, 0, -1), found)

@@ -1,8 +1,8 @@
 """An estimate of the error of one step, from the forces and velocities at its stages.
 
 The estimate needs no further evaluations of forces. The forces of the stages sample the
-rate of the momentum at s points of the step. Multiplied by the inverse mass matrix at
-the start of the step, they sample the rate of the fibre coordinate u. The Legendre
+rate of the momentum p at s points of the step. Multiplied by (∂p/∂u)⁻¹ at the start of
+the step, they sample the rate of the fibre coordinate u (v or p). The Legendre
 coefficients of these samples give the sizes U_k = |h^k u^(k)| of the derivatives of u,
 where k is 1, ..., s. Velocities can also change where momenta do not: if the mass
 matrix depends on time, or when a free body turns. Therefore a second estimate of each
@@ -193,7 +193,8 @@ def _extrapolated(
 
 
 def _root(x: FloatScalar, n: int) -> FloatScalar:
-    # All of these take less time than `x ** (1 / n)`. Their errors do not matter here.
+    # The functions below take less time than `x ** (1 / n)`. Their errors do not matter
+    # here.
     if n > 3:
         return jnp.exp(jnp.log(x) / n)
     return (x, jnp.sqrt(x), jnp.cbrt(x))[n - 1]

@@ -59,14 +59,14 @@ def noise_of_step(
 def magnifications(method: AbstractMethod) -> tuple[float, float]:
     """Compute how much a step magnifies random errors of its constraints.
 
-    The change h N⁻¹ R δΛ of the fibre coordinates in a step is larger, by this factor,
-    than the change that would correct the error of a single constraint. The factor is
-    the largest Euclidean norm of a row of a matrix. For nonholonomic constraints this
-    matrix is E (A_{2:} E)⁻¹. For holonomic constraints it is the inverse of the matrix
-    with the rows A_{2:} Â and b. A, Â and b are the coefficients of the method, A_{2:}
-    is A without its first row, and E is in `closure_weights`. Pseudo-inverses are used,
-    because a method that does not support one of the two kinds of constraints can have
-    a singular matrix.
+    The factor is the ratio of two changes of the fibre coordinates: h N⁻¹ R δΛ in the
+    step, and the change that would correct the error of a single constraint. It is
+    computed as the largest Euclidean norm of a row of a matrix. For nonholonomic
+    constraints this matrix is E (A_{2:} E)⁻¹. For holonomic constraints it is the
+    inverse of the matrix with the rows A_{2:} Â and b. A, Â and b are the coefficients
+    of the method, A_{2:} is A without its first row, and E is in `closure_weights`.
+    Pseudo-inverses are used, because a method that does not support one of the two
+    kinds of constraints can have a singular matrix.
 
     **Returns:** the factor for nonholonomic and the factor for holonomic constraints.
     """

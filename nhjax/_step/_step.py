@@ -427,9 +427,9 @@ def error_ratios(
     The state changes by h Σ b_j (H^j, N⁻¹ n^j), with the velocities H^j and the forces
     n^j of the stages, and with N = ∂p/∂u. A second quadrature leaves out the last node.
     The difference of the two quadratures is the same sum with the weights
-    `method.embedded_difference`. The first ratio is the difference in positions,
-    divided by h and by the change of the state. The second ratio is the difference in
-    fibre coordinates, divided by the same change. See `estimated_error`.
+    `method.embedded_difference`. Changes in positions are divided by h and, if u is p,
+    mapped to momenta. The two ratios are the differences in positions and in fibre
+    coordinates, divided by the largest change of the state. See `estimated_error`.
 
     **Arguments:**
 
@@ -613,7 +613,7 @@ class ImplicitStep(AbstractImplicitFunction[StepArguments, StepOutcome]):
         rates: StepArguments,
         ok: BoolScalar,
     ) -> Changes:
-        """Compute the changes of the stages x, of the state at the end and the record.
+        """Compute the changes of the stages x, the state at the end and the record.
 
         `rates` are the tangents of the `perturbed` part of the arguments. The rest is
         `fixed`. The changes are zero unless the step is `ok`, that is, solved.

@@ -48,7 +48,7 @@ def check_type(name: str, x: object, kind: Kind, advice: str = "") -> None:
 
 
 def check_flag(name: str, x: object) -> bool:
-    """Return `x` as a bool, or raise a `TypeError` if it is anything else."""
+    """Return `x` as a bool, or raise a `TypeError` if it is not True or False."""
     if not isinstance(x, bool | np.bool_):
         known = ", known when tracing" if is_traced(x) else ""
         raise TypeError(

@@ -53,8 +53,7 @@ class Linearisation(eqx.Module):
 
     u is the fibre coordinate of the system, v or p. The free force is the force without
     the reactions of the constraints. With N = ∂p/∂u, the Jacobian B = ∂Φ/∂u of the
-    constraints on velocities, and their reactions R λ, where R = ♭ Bᵀ, the motion
-    satisfies
+    constraints on velocities, and their reactions R λ, the motion satisfies
 
     N u̇ - R λ = ad*_v p + free force - ∂t p - D1p v,    B u̇ = -∂t Φ - D1Φ v.
 
@@ -196,9 +195,10 @@ def motion_residual(
 ) -> tuple[Float[Array, " n"], Float[Array, " l"]]:
     """Compute the residuals of the equations of motion and of the hidden constraint.
 
-    The residuals are ṗ - ad*_v p - W and dΦ/dt along (q̇, u̇) = (q v, a), where a is
-    the given `acceleration`. They vanish if the multiplier is the continuous multiplier
-    λ_c(q, u) and a is the acceleration of the motion.
+    The residuals are ṗ - ad*_v p - W, with the total force W, and dΦ/dt, at the rates
+    (q̇, u̇) = (q v, a), where a is the given `acceleration`. They vanish if the
+    multiplier is the continuous multiplier λ_c(q, u) and a is the acceleration of the
+    motion.
     """
     v = system.velocity(t, q, u, args)
     (p, _), (p_dot, phi_dot) = jax.jvp(

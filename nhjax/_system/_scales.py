@@ -53,7 +53,7 @@ def velocity_scale(
     u: Float[Array, " n"],
     args: Args,
 ) -> Float[Array, " l"]:
-    """Estimate the sizes of the terms of Φ from `jacobian`, ∂Φ/∂u, and Φ at u = 0."""
+    """Estimate the sizes of the terms of Φ from `jacobian` = ∂Φ/∂u and Φ at u = 0."""
     affine = _finite_or_zero(system.constraint(t, q, jnp.zeros_like(u), args))
     return jacobian.absolute_row_sums() * nonzero_or_one(max_norm(u)) + affine
 
@@ -123,8 +123,8 @@ def keeps_constraints(
 ) -> BoolScalar:
     """Return whether all constraints hold at y, up to `small` times their terms.
 
-    Larger violations are allowed too, up to `round_off`: its two entries bound the
-    violations of velocity and of position constraints.
+    Larger violations are allowed too, up to the two bounds in `round_off`: the first is
+    for constraints on velocities, the second for constraints on positions.
     """
     u = system.fibre_coordinate(y)
     positions = system.position_constraint(t, y.q, args)
@@ -149,7 +149,7 @@ class FunctionNoise(NamedTuple):
 
     The functions are the momentum, the free force, all constraints on velocities and
     the holonomic constraints on positions. With a `direction` of u, `function_noise`
-    adds `slopes` for the derivatives of all constraints along this direction.
+    adds `slopes`, the round-off of the derivatives of all constraints along it.
     """
 
     momentum: Float[Array, " n"]

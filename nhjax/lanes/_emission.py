@@ -153,8 +153,8 @@ def _module(writer: Writer, size: int) -> str:
 class LiveNodes:
     """The nodes that the results of a program need, by region and in order.
 
-    A store is needed if its memory is read. A loop is needed if one of its results or a
-    store inside it is needed.
+    A store is needed if it writes a result, or memory that is read. A loop is needed if
+    one of its results or a store inside it is needed.
     """
 
     def __init__(self, results: list[Buffer]):

@@ -97,7 +97,7 @@ def engines(function: Callable[..., Any], *args: Any) -> tuple[EngineUse, ...]:
     """
     token = _uses.set(uses := [])
     try:
-        # This is a new function, so that JAX does not return a cached result.
+        # The lambda is a new function, so that JAX does not return a cached result.
         jax.jit(lambda *args: function(*args)).lower(*args)
     finally:
         _uses.reset(token)

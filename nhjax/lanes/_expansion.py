@@ -21,8 +21,8 @@ from jax.extend.core.primitives import closed_call_p
 
 # Matrices with more rows than this are left to XLA, which calls LAPACK.
 MOST_ROWS = 32
-# With more rows, LAPACK computes singular values in less time, and compiling a call of
-# LAPACK takes less time too.
+# With more rows, LAPACK computes singular values in less time than the written-out
+# program, and compiling a call of LAPACK takes less time too.
 _MOST_ROWS_OF_SINGULAR_VALUES = 12
 # Stacks of more matrices than this are left to XLA too, because the written-out program
 # would be long.
@@ -545,7 +545,7 @@ def _is_real(equation: Any) -> bool:
 
 
 _EXPANSIONS: dict[str, tuple[Callable[[Any], bool], Callable[..., Any]]] = {
-    # The next three are operations since JAX 0.12; before, they were arithmetic.
+    # The next three are primitives since JAX 0.12; before, they became arithmetic.
     "log2": (_is_real, _log2),
     "one_minus_square": (_is_real, _one_minus_square),
     "polynomial": (_is_real, _polynomial),

@@ -1,9 +1,9 @@
 """Exponentials, hyperbolic functions, logarithms, powers and the error function.
 
 All formulas are for vectors of float64. With n the integer nearest to x / log(2),
-exp(x) is 2^n exp(r) with |r| <= log(2) / 2. With x = 2^k m and m from sqrt(1/2) to
-sqrt(2), log(x) is k log(2) + log(m), and log(m) is 2 artanh(s) with s = (m - 1) / (m +
-1). Polynomials approximate exp(r) and artanh(s).
+exp(x) is 2^n exp(r) with r = x - n log(2) and |r| <= log(2) / 2. With x = 2^k m and m
+from sqrt(1/2) to sqrt(2), log(x) is k log(2) + log(m), and log(m) is 2 artanh(s) with
+s = (m - 1) / (m + 1). Polynomials approximate exp(r) and artanh(s).
 """
 
 import math
@@ -104,7 +104,7 @@ def tanh(x: Value) -> Value:
     """Return the hyperbolic tangent of x, as (exp(2x) - 1) / (exp(2x) + 1)."""
     double = absolute(x) * 2.0
     _, above, unit = _expm1_parts(where(double > 44.0, 44.0, double))
-    # exp(2x) - 1 was divided by 2^n, so 2^(1 - n) is added to get exp(2x) + 1.
+    # `above` is (exp(2x) - 1) / 2^n. Adding 2^(1 - n) gives (exp(2x) + 1) / 2^n.
     high, low = two_sum(above[0], unit * 2.0)
     return with_sign(rounded_quotient(above, (high, low + above[1])), x)
 
@@ -128,7 +128,7 @@ def logistic(x: Value) -> Value:
 def _hyperbolic(x: Value, odd: bool) -> Value:
     """Return sinh(|x|) or cosh(x).
 
-    With s = sinh(r), c = cosh(r) and u = 2^-2n, sinh(|x|) is
+    With |x| = n log(2) + r, s = sinh(r), c = cosh(r) and u = 2^-2n, sinh(|x|) is
     2^(n - 1) ((1 - u) c + (1 + u) s). The formula of cosh(x) has -u in place of u.
     """
     x = absolute(x)

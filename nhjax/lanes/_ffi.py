@@ -4,8 +4,8 @@ The structures come from the header `xla/ffi/api/c_api.h` in `jax.ffi.include_di
 They are written as LLVM types, which have the layout of the platform's C compiler.
 Within a major version of the interface, structures only grow at the end, so that the
 offsets of the listed fields do not change. Each structure contains its size, so that
-code compiled with an older header still works. Names may change: the names here are the
-names of version 0.3, and version 0.5 has the same fields at the same offsets. A test
+code compiled with an older header still works. Names may change. The names here are the
+names of version 0.3; version 0.5 has the same fields at the same offsets. A test
 compares the structures with the installed header.
 """
 
@@ -105,7 +105,7 @@ def field(pointer: str, struct: str, *path: str) -> str:
     - `pointer`: the address of the structure.
     - `struct`: the name of the structure.
     - `path`: the name of the field. If the field is a structure, the name of a field in
-        this structure follows.
+        this structure may follow.
     """
     indices, current = ["i32 0"], struct
     for name in path:

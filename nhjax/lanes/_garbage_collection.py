@@ -21,10 +21,10 @@ _outside: tuple[int, int, int] = gc.get_threshold()
 def rare_collections() -> Iterator[None]:
     """Make Python look for cyclic garbage less often inside a `with` block.
 
-    The thresholds of the collector apply to the whole process: the first thread that
-    enters such a block sets them, and the last thread that leaves such a block restores
-    them. If the collector is switched off, or already runs less often, the block has no
-    effect.
+    The thresholds of the collector apply to the whole process. Therefore the first
+    thread that enters such a block sets them, and the last thread that leaves such a
+    block restores them. If the collector is switched off, or already runs less often,
+    the block has no effect.
     """
     global _inside, _outside
     with _lock:

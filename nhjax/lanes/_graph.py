@@ -243,7 +243,8 @@ class Graph:
     def op(self, op: str, *args: Node, dtype: str | None = None) -> Node:
         """Return the node of an elementwise operation, simplified if possible.
 
-        The result has the dtype of the last argument unless `dtype` is given.
+        If `dtype` is not given, comparisons return bool, and other operations return
+        the dtype of the last argument.
         """
         first, last = args[0], args[-1]
         rule = _RULES.get(op)
@@ -385,8 +386,8 @@ _Rule = Callable[..., Node | None]
 
 
 # `_KNOWN`: the `op` of nodes whose value is known. `_SPECIAL`: the `op` of arguments
-# that the rules for sums and products can simplify. Most nodes have another `op`, so
-# that the rules test it first.
+# that the rules for sums and products can simplify. Most nodes have another `op`.
+# Therefore the rules test this first.
 _KNOWN = frozenset(("const", "zero"))
 _SPECIAL = frozenset((*_KNOWN, "neg"))
 
@@ -687,7 +688,8 @@ class BranchBuilder:
 # A copy shares its common subexpressions with its surroundings, and its invariant
 # operations are hoisted out of loops. Therefore programs inside a loop are still copied
 # (written out), unless this loop contains another loop of unknown length. For example,
-# the loop over the steps of a run contains the iterations of the stage solver.
+# the loop over the steps of a run contains such a loop, the iterations of the stage
+# solver.
 #
 # A function is a region of its own, in which `parameter` nodes stand for the arguments.
 # A node `call` stands for all results, and a node `part` for one of them. Both are
@@ -698,7 +700,7 @@ class BranchBuilder:
 # little compile time.
 _SHORTEST = 500
 # A function with constants is replaced by a more general function if the constants save
-# less than this fraction of the nodes.
+# at most this fraction of the nodes.
 _LEAST_GAIN = 0.1
 # A function contains none of these nodes, which access memory, jump or call.
 _STATEMENTS = frozenset(
@@ -785,7 +787,8 @@ class Functions:
 def _unify(one: Function, own: _Pattern, general: Function, wider: _Pattern) -> None:
     """Let `one` call `general`, if the longer code of `general` costs little.
 
-    `general` must have fewer constants, and must not be much longer.
+    All constants of `general` must be constants of `one` too, and `general` must not be
+    much longer.
     """
     pairs = list(zip(own, wider, strict=True))
     is_wider = all(b is None or a is b for a, b in pairs)

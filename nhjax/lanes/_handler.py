@@ -15,8 +15,8 @@ block. The caller's thread runs blocks. Threads of XLA's pool help if this saves
 - When no block is left, the caller waits for the blocks that helpers have begun. It
     does not wait for helpers that have not started: they may never start, because the
     pool has no free thread, or because this process was forked and has no pool any
-    more. A call therefore always ends, because every block that was begun has a thread
-    of its own, which needs no other thread.
+    more. A call therefore always ends: every block that was begun has a thread of its
+    own, which needs no other thread.
 - The data that helpers share with the caller are called the job. The job is freed when
     the last helper has seen that no block is left, which may be long after the call.
 

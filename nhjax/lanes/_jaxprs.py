@@ -65,7 +65,7 @@ COMPILED_ONCE = "compiled_once_"
 CALLING = """
     checkpoint closed_call custom_jvp_call custom_vjp_call jit kept_call remat2
 """.split()  # noqa: SIM905
-# nhjax's own operation, which computes a program for each row of its operands.
+# nhjax's own operation, which runs a program for each row of its operands.
 BATCHED_CALL = "batched_call"
 _CONTAINING = [
     *CALLING,

@@ -126,7 +126,7 @@ def kernel_jvp(operands, tangents, *, program, options):
     try:
         whole = jax.make_jaxpr(linearised)(*operands)
     except ValueError:
-        # JAX cannot linearise a while loop, for instance. Such programs have forward
+        # JAX cannot linearise some programs, such as while loops. They have forward
         # mode only.
         all_rates = [ad.instantiate_zeros(tangent) for tangent in tangents]
         return jax.jvp(run, operands, all_rates)

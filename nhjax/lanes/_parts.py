@@ -82,10 +82,10 @@ def _needed(index: int, equations: list[Any], maker: dict[Any, int]) -> set[int]
 def _across_members(equations: list[Any], is_late: list[bool]) -> list[bool]:
     """Mark operations that must be repeated after the compiled part.
 
-    Operations of other libraries may combine members under `jax.vmap`: an error check
-    computes whether any member has failed. If the part after the compiled part needs
-    results that depend on such operations, JAX computes these operations again, unless
-    they contain loops.
+    Operations of other libraries may combine members under `jax.vmap`; for instance, an
+    error check computes whether any member has failed. If the part after the compiled
+    part needs results that depend on such operations, JAX computes these operations
+    again, unless they contain loops.
     """
     wanted: set[Any] = set()
     serves = []

@@ -7,8 +7,8 @@ the handler with XLA under a name (`register_kernel`).
 The name is a hash of the kernel, the machine, the version of the compiler and the level
 of optimisation. Equal programs therefore have equal names in all processes, and are
 compiled once in each process. A name stays registered with XLA as long as the process
-runs, and an executable may call the handler at any time. Code is therefore never freed:
-a program takes 20 to 150 KB, and `compiled_code` returns the total.
+runs, and an executable may call the handler at any time. Code is therefore never freed.
+A program takes 20 to 150 KB; `compiled_code` returns the total.
 
 Before the graph is built, the key of the jaxpr is looked up (`_cache`): in this
 process, and then in the cache on disk if JAX's options switch it on. An entry on disk
@@ -177,8 +177,8 @@ def llvm_ir(
 LONGEST_UNROLLED_SCAN = 8
 # Programs with more nodes than `MOST_NODES` are refused, unless they have on average at
 # most `NODES_PER_OPERATION` nodes for each operation of JAX. LLVM takes about 10 s for
-# this number of nodes, and minutes for more. XLA does not unroll operations on arrays:
-# it compiles programs with large arrays in a few seconds, but takes longer than LLVM if
+# `MOST_NODES` nodes, and minutes for more. XLA does not unroll operations on arrays: it
+# compiles programs with large arrays in a few seconds, but takes longer than LLVM if
 # there are many small arrays.
 MOST_NODES, NODES_PER_OPERATION = 100_000, 40
 

@@ -265,7 +265,7 @@ class Writer:
 
 
 class Value:
-    """A vector, or a scalar where the width is 1, to be used in formulas.
+    """A vector, or a scalar if the width is 1, for use in formulas.
 
     - `kind`: the LLVM type of the elements, such as `double` or `i64`.
     - `name`: the name of the instruction that computed the vector, or a constant.
@@ -500,14 +500,14 @@ def leading_bits(x: Value, count: int) -> Value:
 
 
 def halves(x: Value) -> DoubleDouble:
-    """Split x into two numbers of 26 bits: products of such numbers are exact."""
+    """Split x into two numbers of 26 bits, whose products are exact."""
     with x.writer.exact():
         upper = leading_bits((x.bits() + _HALF_UNIT).number(), 26)
         return upper, x - upper
 
 
 def two_product(a: Value, b: Value) -> DoubleDouble:
-    """Return a b without error, unless it underflows."""
+    """Return the product a b without error, unless it overflows or underflows."""
     with a.writer.exact():
         high = a * b
         (a1, a2), (b1, b2) = halves(a), halves(b)

@@ -146,7 +146,7 @@ def animate(
 
     if spatial:
         ax.set_box_aspect(tuple(sides))  # pyright: ignore[reportArgumentType]
-        # With this setting `zorder` puts lines and marks in front of filled bodies.
+        # Without `computed_zorder`, lines and marks are in front of filled bodies.
         axes: Any = ax
         axes.computed_zorder = False
     else:
@@ -214,7 +214,7 @@ def _frame_times(times: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def _at(shown: np.ndarray, times: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    # `numpy.interp` needs increasing times: the signs of decreasing times are changed.
+    # `numpy.interp` needs increasing times, so that decreasing times are negated.
     forwards = 1 if times[-1] > times[0] else -1
     columns = positions.reshape(len(times), -1).T
     values = [np.interp(forwards * shown, forwards * times, x) for x in columns]
@@ -244,7 +244,7 @@ def _height(
     reach: float,
     ground: float | None,
 ) -> float:
-    """Compute half a 3D picture's height: 0.5 to 1 times half its width `reach`."""
+    """Compute half a 3D picture's height: 0.5 to 1 times `reach`, half its width."""
     heights = [x[..., 2].reshape(len(x), -1) for x in frames.values()]
     if ground is not None:
         heights.append(np.full((len(centres), 1), ground))

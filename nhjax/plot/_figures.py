@@ -36,7 +36,7 @@ def trajectory(
 ) -> "Axes":
     """Draw the path of two or three coordinates of a trajectory.
 
-    All axes have the same unit length.
+    One unit has the same length on all axes.
 
     **Arguments:**
 

@@ -295,7 +295,7 @@ class _Case(NamedTuple):
 def _program(
     case: _Case, members: int, every: int, weights: np.ndarray
 ) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-    """Return two functions: the run of a member, and initial data from its index."""
+    """Return two functions: one runs a member, the other computes its initial data."""
     chaotic = ChaoticSystem()
 
     def member(j: Array) -> tuple[Array, Array]:

@@ -140,7 +140,7 @@ class CVTEnergy(AbstractStudyResult):
         return data
 
     def table(self) -> str:
-        """Format a table of the energy errors in each fifth of a run, and ranges."""
+        """Format a table: energy errors in each fifth of a run, and energy ranges."""
         header = ["regime", "s", "h"]
         header += [f"max|E-E0| {i}/5" for i in range(1, 6)]
         header += ["range of ΔE_d", "range of ΔE_p", "run s"]

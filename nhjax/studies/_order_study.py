@@ -97,7 +97,7 @@ class AbstractOrderStudy(AbstractStudyResult):
 
     def slopes(self) -> np.ndarray:
         """Return observed orders in the shape of `errors`; undefined orders are NaN."""
-        # In runs to T = 3, round-off is below 1e-14: errors up to 1e-13 are ignored.
+        # Errors up to 1e-13 are ignored. In runs to T = 3, round-off is below 1e-14.
         return np.stack([slopes(self.dt, e, floor=1e-13) for e in self.errors])
 
     def orders(self) -> np.ndarray:

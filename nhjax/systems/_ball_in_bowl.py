@@ -186,8 +186,8 @@ class BallInBowl(AbstractConstrainedGroupExample):
     def invariants(self, t: FloatScalarLike, q: Element, v: Array) -> dict[str, Array]:
         """Compute the moving energy, and in a sphere two more conserved quantities.
 
-        In a sphere `normal_spin` κ a (R ω)·n - Ω (1 + κ a) n₃ and `vertical_momentum`
-        k m a² (R ω)₃ - κ a m (x ẏ - y ẋ) are conserved too.
+        These are `normal_spin` = κ a (R ω)·n - Ω (1 + κ a) n₃ and `vertical_momentum` =
+        k m a² (R ω)₃ - κ a m (x ẏ - y ẋ).
         """
         omega, normal = SO3().Ad(q[0], v[:3]), self.bowl.normal(q[1])
         spin = self.inertia_ratio * self.mass * self.radius**2 * omega[2]

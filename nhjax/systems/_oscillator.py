@@ -16,12 +16,14 @@ class HarmonicOscillator(AbstractExample):
 
     L = m/2 |v|² - k/2 |q|².
 
+    Without constraints, a Lobatto IIIA-IIIB pair is an ordinary symplectic integrator.
+    With m = k = 1, the two-stage method returns to the initial point after exactly N
+    steps of h = 2 sin(π/N).
+
     **Parameters:** `mass` m [kg], `stiffness` k [N/m]; the shape of `q0` and `v0`
     sets the dimension.
 
-    **Source:** any textbook. Without constraints, a Lobatto IIIA-IIIB pair is an
-    ordinary symplectic integrator. With m = k = 1, the two-stage method returns to the
-    initial point after exactly N steps of h = 2 sin(π/N).
+    **Source:** any textbook.
 
     !!! example
 

@@ -83,7 +83,7 @@ class FreeRigidBody(AbstractExample):
         }
 
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Compute (q, v, λ) at time `t`; λ is empty without constraints.
+        """Compute (q, v, λ) at time `t`; λ is empty, because there are no constraints.
 
         ω is given by Jacobi's elliptic functions. The attitude then satisfies a linear
         differential equation, which is solved to round-off.

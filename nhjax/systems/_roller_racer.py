@@ -22,7 +22,7 @@ from ._planar import direction, kinetic_energy
 
 
 class RollerRacer(AbstractGaitMachine):
-    """Two bodies with one axle each, joined by a pivot that the rider swings.
+    """Two bodies with one axle each and a pivot, about which the rider swings them.
 
     L = m₁/2 |ṙ₁|² + I₁/2 θ̇² + m₂/2 |ṙ₂|² + I₂/2 (θ̇ + φ̇)²,
     Φ = (n₁ · ṙ₁, n₂ · ṙ₂),  r₂ = r₁ + d₁ e(θ) + d₂ e(θ + φ).

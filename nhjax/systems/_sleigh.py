@@ -75,9 +75,9 @@ class ChaplyginSleigh(AbstractConstrainedExample):
     def exact(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute (q, v, λ) at `t`, for consistent data with θ̇ != 0 and `offset` != 0.
 
-        u = √(2E/m) tanh τ and θ̇ = ±√(2E/I) sech τ with τ = κt + c, κ = a√(2Em)/I and
-        the energy E. The heading is an elementary function of time, and (x, y) is an
-        integral over time.
+        u = √(2E/m) tanh τ and θ̇ = ±√(2E/I) sech τ with τ = κt + c, κ = a√(2Em)/I, the
+        energy E and a constant c. The heading is an elementary function of time, and
+        (x, y) is an integral over time.
         """
         (x0, y0, heading0), (dx0, dy0, omega0) = self._consistent_data()
         m, a = float(self.mass), float(self.offset)

@@ -33,11 +33,11 @@ class Snakeboard(AbstractGaitMachine):
     at the distance l behind and ahead of the centre, and do not slip sideways. If
     φ_b = φ_f = π/2, the constraints are dependent.
 
-    A `gait` prescribes the joints by the constraints Γ = (ψ, φ_b, φ_f) - gait(t). With
-    `gait=None` the joints move freely under the torques (τ_ψ, τ_b, τ_f) [N m] in
-    `args`, of shape (3,) or `None`. In the default gait, the rotor and the steering
-    oscillate at the same frequency. This gait drives the board from rest along its
-    axis. With other ratios of the frequencies, the board turns in place or moves
+    A `gait` prescribes the joint angles by constraints Γ = (ψ, φ_b, φ_f) - gait(t).
+    With `gait=None` the joints move freely under the torques (τ_ψ, τ_b, τ_f) [N m] in
+    `args`, which has shape (3,) or is `None`. In the default gait, the rotor and the
+    steering oscillate at the same frequency. This gait drives the board from rest along
+    its axis. With other ratios of the frequencies, the board turns in place or moves
     sideways (parking gait).
 
     **Parameters:** `mass` m [kg]; `inertia` J of the board, `rotor_inertia` J_r and

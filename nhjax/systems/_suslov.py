@@ -27,8 +27,8 @@ class Suslov(AbstractConstrainedGroupExample):
 
     Here q is the attitude quaternion, and ω is the body angular velocity. The body axes
     are chosen so that I₁₂ = 0. If the fixed axis, e₃, is not a principal axis, every
-    motion tends to a steady rotation about an axis in the plane of e₁ and e₂: these
-    rotations are attracting, although energy is conserved.
+    motion tends to a steady rotation about an axis in the plane of e₁ and e₂, although
+    energy is conserved.
 
     **Parameters:** `moments` (I₁₁, I₂₂, I₃₃) and `products` (I₁₃, I₂₃) of inertia
     [kg m²]; `retraction`, the retraction of SO(3).

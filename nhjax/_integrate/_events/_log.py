@@ -10,7 +10,7 @@ from .._solution import EventLog
 
 
 class LogEntry(eqx.Module):
-    """The entry of one event in the log, or the entries of all along a leading axis.
+    """The log entry of one event, or the entries of all events along a leading axis.
 
     A reverse replay, for derivatives, undoes the step to an event from `before`, the
     state at the event before the reset. It also needs the following fields.

@@ -28,7 +28,7 @@ class TruncatedStep(NamedTuple):
 
     - `outcome`: the outcome of the step.
     - `h`: the size of the step.
-    - `fired`: the index of the event at the step's end, -1 if it is not truncated.
+    - `fired`: the index of the event that truncates the step, -1 for no event.
     - `values`: the values of the conditions at the step's end.
     - `crossed`: the conditions that crossed zero in the step.
     """

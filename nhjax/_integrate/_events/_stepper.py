@@ -104,8 +104,8 @@ class EventCarry(AbstractCarry):
 class ReplayedIteration(eqx.Module):
     """The data that a reverse replay has about an iteration, besides its state.
 
-    - `node`, `offset`, `num_events`: the start of the iteration, as in
-      `EventLoopState`.
+    - `node`, `offset`, `num_events`: the values at the start of the iteration, as in
+        `EventLoopState`.
     - `row`: the number of output rows that were filled before. For a discarded
         iteration it is the number of steps of the run, which is the index of an unused
         row.
@@ -186,7 +186,7 @@ class AttemptedStep(NamedTuple):
 
 
 class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
-    """Steps from node to node that are truncated at events.
+    """Steps from node to node, truncated at events.
 
     `plain` takes the single steps. `sizes` chooses their sizes, or is None for constant
     steps.
@@ -339,7 +339,7 @@ class EventStepper(AbstractStepper[EventCarry, ReplayedIteration]):
             is_bad = is_bad & (found != RESULTS.successful)
             result = RESULTS.where(is_bad, found, result)
             ends = ends | is_bad
-            # The limit `max_steps` does not count iterations for events.
+            # Iterations for events do not count towards `max_steps`.
             rejected = attempt.is_rejected.astype(jnp.int32)
             number = after.node + carry.stats["num_rejected_steps"] + rejected
             is_last = jnp.asarray(i, jnp.int32) + 1 >= self.num_iterations
@@ -603,7 +603,7 @@ def _place_after(
 ) -> EventLoopState:
     """Return the place after an iteration; its signs and rows are not updated yet.
 
-    Events that are `pending` are handled before a node at the same time.
+    If events are `pending` at the time of a node, they are handled before the node.
     """
     here, dt = before.offset + attempt.size, attempt.whole
     # If the rest of a step is only round-off, it is skipped.
@@ -779,7 +779,8 @@ class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
             signs=ConditionSigns(start.signs.sign, scales, at_zero),
             pending=is_one & (replay.size == 0),
         )
-        # An idle iteration is repeated as an iteration after the end of the run.
+        # An idle or discarded iteration is repeated as an iteration after the end of
+        # the run.
         ended = RESULTS.event_occurred
         result = RESULTS.where(replay.is_active, RESULTS.successful, ended)
         return EventCarry(step_state, result, self.start.stats, place)
