@@ -68,10 +68,10 @@ def momentum_map(
 ) -> Float[Array, "..."]:
     """Compute the momentum p · ξ_Q(q) along an infinitesimal symmetry ξ_Q.
 
-    The momentum is conserved if ξ_Q is a symmetry of the Lagrangian, the constraints
-    permit the virtual displacement ξ_Q, that is, D2Φ · ξ_Q = 0, and external forces do
-    no work along ξ_Q. Otherwise the momentum satisfies the nonholonomic momentum
-    equation.
+    The momentum is conserved under three conditions: ξ_Q is a symmetry of the
+    Lagrangian; the constraints permit the virtual displacement ξ_Q, that is,
+    D2Φ · ξ_Q = 0; and external forces do no work along ξ_Q. Otherwise the momentum
+    satisfies the nonholonomic momentum equation.
 
     **Arguments:**
 

@@ -255,7 +255,7 @@ class ZarrSink(AbstractSink):
         array: Any = zarr.open_array(str(self.path / "t"), mode="r")
         times = np.asarray(array[0])
         self.encoder = self._encoder(self.variables | {"time": (("time",), times)})
-        # The folder `time` comes last, because it marks this step as complete.
+        # The folder `time` is moved into place last: if it exists, the times are saved.
         for name, data in self.encoder.chunk("time", 0, times).items():
             durable.write(self.path / ".time.unfinished" / name, data)
         metadata = self.encoder.metadata()

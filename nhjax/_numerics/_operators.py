@@ -461,9 +461,9 @@ def jacobian_by_rows(
 
 
 def _unit_vectors(u: Float[Array, " n"]) -> Float[Array, "n n"]:
-    # The rows are padded, because `nhjax.lanes` omits products with zeros that pad an
-    # array, even if the other factor may be infinite. It must keep products with the
-    # zeros of `jnp.eye`.
+    # The rows are made by padding, which saves time: `nhjax.lanes` omits products with
+    # zeros that pad an array, even if the other factor may be infinite. It must keep
+    # products with the zeros of `jnp.eye`.
     n, one, zero = u.shape[0], jnp.ones((1,), u.dtype), jnp.zeros((), u.dtype)
     rows = [jax.lax.pad(one, zero, [(k, n - 1 - k, 0)]) for k in range(n)]
     return jnp.stack(rows)

@@ -656,7 +656,8 @@ class _LoopResults:
             index = result.attr[1]
             slot = memory.slot(result.dtype)
             if is_partial:
-                # Members that do not enter the loop get an arbitrary value.
+                # Members that do not enter the loop get its initial value; any value
+                # would do.
                 self._write(result, self._in_memory(loop.inits[index]), slot)
             self.slots.append((result, loop.params[index], slot))
 

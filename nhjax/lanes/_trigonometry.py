@@ -48,8 +48,9 @@ _REDUCED_LARGE = "nhjax.reduced_large"
 def _window(exponent: Value) -> list[Value]:
     """Load the 192 digits of 2 / pi that matter for an x with this biased exponent."""
     writer = exponent.writer
-    # With e = exponent - 1075, digit i adds a multiple of 2^(e - i) to the product. The
-    # digits with 2^(e - i) >= 4 are left out.
+    # With e = exponent - 1075, digit i adds a multiple of 2^(e - i) to the product of x
+    # and 2 / pi. The product matters only modulo 4, so the digits with 2^(e - i) >= 4
+    # are left out.
     skipped = where(exponent < 1013, 0, exponent - 1013)
     word, shift = skipped >> 6, skipped & 63
     words = []

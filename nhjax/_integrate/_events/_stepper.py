@@ -709,9 +709,9 @@ class EventReverseReplay(AbstractReverseReplay[EventCarry, ReplayedIteration]):
         """Find the data of iteration i and the state from which it started.
 
         Iterations are undone from the last to the first, and `following` has the start
-        of iteration i + 1. If the last remaining entry of the log has the number of
-        this iteration, the iteration ended at that event, and the step back starts from
-        the state `before` the reset.
+        of iteration i + 1. Let the entry be the last one in the log whose event is not
+        yet undone. If the entry has the number i, iteration i ended at this event, and
+        the step back starts from the state `before` the reset.
         """
         plain, end = self.stepper.plain, self.end.place
         i = i.astype(jnp.int32)
