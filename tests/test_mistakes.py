@@ -1691,6 +1691,20 @@ RESULTS_OF_RUNS = [
         "`mass` must be positive, got -1.0",
     ),
     row(
+        "gave the bicycle a number as steering",
+        lambda: systems.WhippleBicycle(steering=3.0),  # pyright: ignore
+        TypeError,
+        "`steering` must be a function of",
+    ),
+    row(
+        "gave the bicycle a steering that returns a force for each coordinate",
+        lambda: systems.WhippleBicycle(
+            steering=lambda t, q, v, args: 0 * v
+        ).initial_state(),
+        nhjax.ShapeError,
+        "must return one torque of shape (), got shape (8,)",
+    ),
+    row(
         "gave a machine of the gallery a word as mass",
         lambda: systems.HarmonicOscillator(mass="heavy"),  # pyright: ignore
         TypeError,

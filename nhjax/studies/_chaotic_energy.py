@@ -259,9 +259,10 @@ def chaotic_energy(
     num_steps = {h: whole_steps(final_time, h) for h in dt}
     for h in dt:
         if save_every * h > WINDOW:
-            name, value = ("dt", h) if save_every == 1 else ("save_every", save_every)
             raise ArgumentError(
-                name, f"must leave samples in a window of ±{WINDOW:g}, got {value:g}"
+                "dt" if save_every == 1 else "save_every",
+                f"must leave at most {WINDOW:g} units of time between samples, but "
+                f"{save_every} steps of {h:g} take {save_every * h:g}",
             )
     runs = [
         _run(case, members, times, progress)

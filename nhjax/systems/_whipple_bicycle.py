@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import Args, FloatScalarLike
+from .._errors import ShapeError
 from .._system import LagrangianSystem
 from ._base import (
     AbstractNonholonomicExample,
@@ -137,6 +138,11 @@ class WhippleBicycle(AbstractNonholonomicExample):
             require_positive(**{name: getattr(self, name) for name in names})
             require_positive(**{frame: getattr(self, frame)[:3]})
         require_positive(wheelbase=self.wheelbase, gravity=self.gravity)
+        if self.steering is not None and not callable(self.steering):
+            raise TypeError(
+                "WhippleBicycle: `steering` must be a function of (t, q, v, args) that "
+                f"returns a torque, or None, got {self.steering!r}."
+            )
 
     @classmethod
     def running(
@@ -207,7 +213,13 @@ class WhippleBicycle(AbstractNonholonomicExample):
         force = jnp.zeros_like(v)
         if self.steering is None:
             return force
-        return force.at[5].set(self.steering(t, q, v, args))
+        torque = jnp.asarray(self.steering(t, q, v, args), force.dtype)
+        if torque.shape != ():
+            raise ShapeError(
+                "WhippleBicycle: `steering(t, q, v, args)` must return one torque of "
+                f"shape (), got shape {torque.shape}."
+            )
+        return force.at[5].set(torque)
 
     def invariants(self, t: FloatScalarLike, q: Array, v: Array) -> dict[str, Array]:
         """Compute the energy, which is conserved if `steering` is None."""

@@ -163,7 +163,11 @@ def test_study_run_quick_is_smaller_and_options_override_it(
         ("run chaotic-energy --num-steps 0", "--num-steps: must be at least 1"),
         ("run chaotic-energy --num-steps 5 --final-time 1", "not allowed with"),
         ("run chaotic-energy --times 300", "--times: must lie within the run, got 300"),
-        ("run chaotic-energy --save-every 90", "--save-every: must leave samples"),
+        (
+            "run chaotic-energy --save-every 90",
+            "--save-every: must leave at most 5 units of time between samples, but 90 "
+            "steps of",
+        ),
         ("run chaotic-energy --closure free", "--closure: invalid choice"),
         ("run cvt-energy --regimes middle", "--regimes: must be among"),
         ("run cvt-energy --epsilon -1", "--epsilon: must be at least 0"),
