@@ -235,6 +235,24 @@ def test_plain_call_with_a_tolerance_and_unsolved_steps_names_the_full_jacobian(
         assert 'SimplifiedNewton(jacobian="full")`' in told[0]
 
 
+def test_plain_call_that_does_not_reach_its_end_names_unsolved_steps_too():
+    """More steps do not help such a run, so the advice comes with the error."""
+    system = nhjax.LagrangianSystem(lambda t, q, v, args: 0.5 * v @ v - 0.5 * q @ q)
+    y0 = nhjax.initial_state(system, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]))
+    with (
+        pytest.warns(UserWarning, match=r'SimplifiedNewton\(jacobian="full"\)'),
+        pytest.raises(nhjax.IntegrationError, match="num_unsolved_steps"),
+    ):
+        nhjax.integrate(
+            system,
+            nhjax.LobattoIIIAB(4),
+            y0,
+            t1=1e5,
+            max_steps=100,
+            stepsize_controller=nhjax.PIDController(rtol=1e3, atol=1e3),
+        )
+
+
 def test_plain_call_without_slopes_of_forces_fails_without_advice_of_newton():
     with pytest.raises(nhjax.IntegrationError, match="smaller `dt`") as failure:
         stiff_spring(lambda t, q, v, args: drag_without_forward_derivative(v))
