@@ -63,7 +63,7 @@ import nhjax
 from nhjax import systems
 from nhjax._method import AbstractMethod
 from nhjax._numerics import max_norm, NOISE_UNITS, nonzero_or_one
-from nhjax._step import ImplicitStep, StepOutcome, StepState
+from nhjax._step import StepOutcome, StepState
 from nhjax._step._equations import (
     stage_residual,
     StageEquations,
@@ -250,7 +250,6 @@ def run(
     one solver.
     """
     solvers = nhjax.SimplifiedNewton(), nhjax.Newton()
-    go_on = jnp.asarray(False)
 
     def of_size(h):
         def advance(carry, k):
@@ -258,10 +257,7 @@ def run(
             arguments = replace(start, t=k * h, step_state=step_state)
             stages = equations_of_step(arguments, method)
             first, second = (
-                ImplicitStep(method=method, stage_solver=solver, skip=go_on).solve(
-                    arguments
-                )
-                for solver in solvers
+                near_rest.take_step(arguments, method, solver) for solver in solvers
             )
             row = compared(step_state.state, stages, first, second)
             good = first.result == nhjax.RESULTS.successful
@@ -292,17 +288,13 @@ def single_steps(
     sizes: Float[Array, " k"],
 ) -> Row:
     """Take one step from each state with both solvers; each state has its own size."""
-    go_on = jnp.asarray(False)
     solvers = nhjax.SimplifiedNewton(), nhjax.Newton()
 
     def one(start):
         arguments = near_rest.first_arguments(system, method, *start)
         stages = equations_of_step(arguments, method)
         first, second = (
-            ImplicitStep(method=method, stage_solver=solver, skip=go_on).solve(
-                arguments
-            )
-            for solver in solvers
+            near_rest.take_step(arguments, method, solver) for solver in solvers
         )
         return compared(start[0], stages, first, second)
 
@@ -479,9 +471,7 @@ def moved_by_last_digit(
         arguments = near_rest.first_arguments(
             system, method, unravel(z * (1 + eps * move)), h
         )
-        never = jnp.asarray(False)
-        step = ImplicitStep(method=method, stage_solver=nhjax.Newton(), skip=never)
-        return step.solve(arguments)
+        return near_rest.take_step(arguments, method, nhjax.Newton())
 
     ends = jax.lax.map(end, moves)
     first, others = (

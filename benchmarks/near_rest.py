@@ -42,7 +42,7 @@ from jaxtyping import Array, Float
 import nhjax
 from nhjax import systems
 from nhjax._numerics import max_norm
-from nhjax._step import first_step_state, ImplicitStep, StepArguments
+from nhjax._step import first_step_state, ImplicitStep, StepArguments, StepOutcome
 from nhjax._step._equations import stage_residual, StageUnknowns
 from nhjax._step._jacobian import increment_size
 from nhjax._step._step import equations_of_step
@@ -95,6 +95,12 @@ def first_arguments(system, method, y0, h) -> StepArguments:
     return StepArguments(system, zero, h, first, None, noise=noise)
 
 
+def take_step(arguments: StepArguments, method, solver, skip=False) -> StepOutcome:
+    """Take one step with a solver."""
+    step = ImplicitStep(method=method, stage_solver=solver, skip=jnp.asarray(skip))
+    return step.solve(arguments)
+
+
 @eqx.filter_jit
 def steps(system, method, solver, y0, h) -> Tried:
     """Take `NUM_STEPS` steps as `integrate` does, and stop at a step that fails."""
@@ -103,9 +109,7 @@ def steps(system, method, solver, y0, h) -> Tried:
     def advance(carry, k):
         step_state, alive = carry
         arguments = replace(first, t=k * h, step_state=step_state)
-        outcome = ImplicitStep(method=method, stage_solver=solver, skip=~alive).solve(
-            arguments
-        )
+        outcome = take_step(arguments, method, solver, ~alive)
         good = alive & (outcome.result == nhjax.RESULTS.successful)
         after = jax.tree.map(
             lambda new, old: jnp.where(good, new, old), outcome.step_state, step_state

@@ -336,7 +336,8 @@ def integrate(
             break
     if valid is not None:
         sol = _invalid_unless(valid, sol)
-    if not _is_tracing() and ended_as(sol, "interrupted"):
+    is_interrupted = not _is_tracing() and ended_as(sol, "interrupted")
+    if is_interrupted:
         done = int(sol.stats["num_steps"])
         of = "" if isinstance(grid, VariableGrid) else f" of {grid.num_steps}"
         message = _INTERRUPTED.format(f"{done}{of}", float(sol.t1))
@@ -345,7 +346,7 @@ def integrate(
         # The warning comes before errors are raised, because unsolved steps can be the
         # reason why a run did not reach its end.
         _warn_of_iterations(sol, system, t0, state, args)
-    if throw and (_is_tracing() or not ended_as(sol, "interrupted")):
+    if throw and not is_interrupted:
         _require_constraints(sol, system, t0, state, args)
         sol = raise_failures(sol, size, used_newton)
     if size is not None:

@@ -1,9 +1,10 @@
 """The methods: Lobatto IIIA-IIIB, Gauss, and partitioned methods from any tableau.
 
-A step has s multipliers Λ^1, ..., Λ^s per constraint. By hypothesis H1, stage 1 is the
-state at t_k, where the constraint holds already. This leaves s - 1 equations per
-constraint. A multiplier closure writes the multipliers in terms of s - 1 unknowns y,
-and of multipliers λ_k and λ_{k+1} at the ends of the step, with constant weights,
+For each constraint, a step has s multipliers Λ^1, ..., Λ^s. By hypothesis H1, stage 1
+is the state at t_k, where the constraint already holds. So there are only s - 1
+equations for each constraint. A multiplier closure writes the multipliers in terms of s
+- 1 unknowns y, and of multipliers λ_k and λ_{k+1} at the ends of the step, with
+constant weights,
 
     (Λ^1, ..., Λ^s) = start λ_k + end λ_{k+1} + E y.
 

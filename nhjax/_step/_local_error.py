@@ -195,9 +195,11 @@ def _extrapolated(
 def _root(x: FloatScalar, n: int) -> FloatScalar:
     # The functions below take less time than `x ** (1 / n)`. Their errors do not matter
     # here.
-    if n > 3:
-        return jnp.exp(jnp.log(x) / n)
-    return (x, jnp.sqrt(x), jnp.cbrt(x))[n - 1]
+    if n == 1:
+        return x
+    if n <= 3:
+        return jnp.sqrt(x) if n == 2 else jnp.cbrt(x)
+    return jnp.exp(jnp.log(x) / n)
 
 
 @functools.cache

@@ -558,8 +558,9 @@ class ImplicitStep(AbstractImplicitFunction[StepArguments, StepOutcome]):
             small = float(jnp.finfo(p.dtype).eps) ** 0.5
             small = small + 100 * self.stage_solver.tolerance
             allowed = None if stages.noise is None else stages.noise.violations
-            given = system, lin_next, t + h, end, args, small, allowed
-            holds = keeps_constraints(*given)
+            holds = keeps_constraints(
+                system, lin_next, t + h, end, args, small, allowed
+            )
             lost = (result == RESULTS.successful) & ~holds
             result = RESULTS.where(lost, RESULTS.lost_constraints, result)
         residual, worst = largest_column(forces.residual, solved.aux.node_residual)

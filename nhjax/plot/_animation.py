@@ -53,7 +53,8 @@ def animate(
         hub to the point of the rim. If this point is fixed in the wheel, the line shows
         how the wheel turns.
     - `traced`: the names of points whose past paths are drawn.
-    - `ground`: the height at which the ground is drawn. By default no ground is drawn.
+    - `ground`: the height of the ground in the picture. The default, None, draws no
+        ground.
     - `follow`: the name of a point that stays in the centre of the picture. By default
         the picture does not move.
     - `speed`: the number of seconds of the motion in one second of the animation.
